@@ -1,0 +1,29 @@
+"""What can go wrong, and whose fault it is.
+
+The caller's mistakes raise here, at the boundary, with what was expected and what came. The failures of data
+(an empty set, an infeasible QP, a missing robot) are values: statuses and masks, so one bad item never kills a batch.
+"""
+
+
+class FsidError(Exception):
+    """Root of everything torchfsid raises on purpose."""
+
+
+class InputError(FsidError, ValueError):
+    """An argument is not what the function takes: its name, what was expected, what came."""
+
+    def __init__(self, argument: str, expected: str, actual: object):
+        super().__init__(f"{argument}: expected {expected}, got {actual}")
+        self.argument, self.expected, self.actual = argument, expected, actual
+
+
+class ConfigError(FsidError):
+    """A configuration is wrong: the path of the key, what was expected, what came."""
+
+
+class LogError(FsidError):
+    """A log cannot be read as one: the file, the line, what is wrong there."""
+
+
+class SolverError(FsidError):
+    """A third-party solver failed; the original exception is the cause."""

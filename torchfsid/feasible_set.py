@@ -1,0 +1,244 @@
+r"""The feasible set Theta(t): where the parameter must lie, given everything seen so far (G., Eq. (3)).
+
+    Theta(t) = Theta_0  intersected with all  Omega(tau), tau <= t          Theta_0 a box, the prior
+
+A set is a value: `intersect` returns the next one. In the plane it is a batch of polygons (differentiable), elsewhere a
+batch of polytopes. Its promises: it contains the truth if all half-spaces do; its volume never grows; it stays bounded;
+the order of the half-spaces does not matter; it takes the memory of its facets, of which there are at most
+`max_facets`, merged outward. Each facet remembers when and from which constraint it came.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchfsid.clipping import Outcome, clip, merge
+from torchfsid.errors import InputError
+from torchfsid.halfspaces import Halfspaces
+from torchfsid.polygon import ROUND_OFF, Polygon
+from torchfsid.polytope import Polytope, clip_polytope, merge_polytope
+
+MAX_FACETS = 32
+"""Facets kept; more are merged outward. Costs below 1 % of the volume (tests/test_feasible_set.py)."""
+
+
+class Facets(NamedTuple):
+    """Rows of a set, with the time each came [s] (NaN: the prior) and the constraint (`source`; -1: the prior)."""
+
+    halfspaces: Halfspaces
+    time: Float[Tensor, "*batch f"]
+    source: Int[Tensor, "*batch f"]
+
+
+class Emptiness(NamedTuple):
+    """A three-way answer.
+
+    NONEMPTY comes with a `witness` inside (NaN otherwise), EMPTY with the rows that contradict (NaN otherwise);
+    UNDECIDED says that the half-spaces touch within round-off, and that the set kept is an outer one.
+    """
+
+    outcome: Int[Tensor, "*batch"]
+    witness: Float[Tensor, "*batch p"]
+    contradiction: Facets
+
+
+@dataclass(frozen=True)
+class FeasibleSet:
+    """A batch of bounded convex sets of parameters. Build it with `from_box`, shrink it with `intersect`.
+
+    Attributes:
+        body: the sets, batch flattened.
+        batch_shape: the batch.
+        outcome: an `Outcome` per item; an EMPTY item contains nothing and stays empty, whatever its body.
+        contradiction: for EMPTY items the rows that no parameter satisfies together.
+        last_cut: the time of the intersection that last shrank the set [s]; NaN: never.
+        max_facets: facets kept.
+    """
+
+    body: Polygon | Polytope
+    batch_shape: torch.Size
+    outcome: Int[Tensor, "*batch"]
+    contradiction: Facets
+    last_cut: Float[Tensor, "*batch"]
+    max_facets: int
+
+    @classmethod
+    def from_box(
+        cls, lower: Float[Tensor, "*batch p"], upper: Float[Tensor, "*batch p"], max_facets: int = MAX_FACETS
+    ) -> FeasibleSet:
+        """The prior Theta_0 = [lower, upper].
+
+        Raises:
+            InputError: shapes differ, or lower < upper fails somewhere, or `max_facets` cannot bound a set.
+        """
+        lower, upper = torch.as_tensor(lower).to(torch.float64), torch.as_tensor(upper).to(torch.float64)
+        if lower.shape != upper.shape or lower.ndim == 0:
+            raise InputError("lower, upper", "two tensors (*batch, p)", (tuple(lower.shape), tuple(upper.shape)))
+        if not bool((lower < upper).all()):
+            raise InputError("lower, upper", "lower < upper in every coordinate", (lower.tolist(), upper.tolist()))
+        batch, p = lower.shape[:-1], lower.shape[-1]
+        if max_facets < 2 * p:
+            raise InputError("max_facets", f"at least {2 * p}, the facets of the prior box", max_facets)
+        kind = Polygon if p == 2 else Polytope
+        nothing = lower.new_full((*batch, p + 1), float("nan"))
+        return cls(
+            body=kind.from_box(lower.reshape(-1, p), upper.reshape(-1, p)),
+            batch_shape=batch,
+            outcome=torch.full(batch, Outcome.NONEMPTY, device=lower.device),
+            contradiction=Facets(
+                Halfspaces(nothing.unsqueeze(-1).expand(*batch, p + 1, p), nothing),
+                nothing,
+                torch.full_like(nothing, -1).long(),
+            ),
+            last_cut=lower.new_full(batch, float("nan")),
+            max_facets=max_facets,
+        )
+
+    @property
+    def dim(self) -> int:
+        return self.body.vertices.shape[-1]
+
+    @property
+    def is_empty(self) -> Bool[Tensor, "*batch"]:
+        return self.outcome == Outcome.EMPTY
+
+    def intersect(self, halfspaces: Halfspaces, time: float | Float[Tensor, "*batch"] = float("nan")) -> FeasibleSet:
+        """The part of the set inside the half-spaces, whose facets are stamped with `time` [s] and the rows' `source`
+        (default: 0, 1, ...).
+
+        Rows that only touch the set within round-off are left out (an outer set). If merging facets would cost more
+        than the cut has gained, the set stays as it was.
+
+        Raises:
+            InputError: dimension or batch do not fit, or a row is NaN or infinite.
+        """
+        p, m = self.dim, halfspaces.rows
+        if halfspaces.dim != p or torch.broadcast_shapes(halfspaces.batch_shape, self.batch_shape) != self.batch_shape:
+            expected = f"rows over R^{p} for a batch {tuple(self.batch_shape)}"
+            raise InputError("halfspaces", expected, (tuple(halfspaces.A.shape), tuple(halfspaces.b.shape)))
+        if not bool(halfspaces.A.isfinite().all() & halfspaces.b.isfinite().all()):
+            raise InputError("halfspaces", "finite rows", "NaN or infinity")
+        source = torch.arange(m, device=self.outcome.device) if halfspaces.source is None else halfspaces.source
+        halfspaces = halfspaces.where(~self.is_empty.unsqueeze(-1))
+        cut, joined = (clip, merge) if isinstance(self.body, Polygon) else (clip_polytope, merge_polytope)
+        stamp = torch.as_tensor(time, dtype=torch.float64, device=self.outcome.device).expand(self.batch_shape)
+        clipped = cut(
+            self.body,
+            halfspaces.A.expand(*self.batch_shape, m, p).reshape(-1, m, p),
+            halfspaces.b.expand(*self.batch_shape, m).reshape(-1, m),
+            stamp.reshape(-1),
+            source.expand(*self.batch_shape, m).reshape(-1, m),
+        )
+        body, shrunk = clipped.body, clipped.shrunk
+        over = (body.count > self.max_facets).nonzero().squeeze(-1)
+        if len(over) > 0:
+            merged = joined(body.select(over), self.max_facets)
+            grown = merged.volume() > self.body.select(over).volume()
+            body = body.replaced(over, merged).replaced(over[grown], self.body.select(over[grown]))
+            shrunk = shrunk.index_fill(0, over[grown], False)
+        shape = self.batch_shape
+        found = clipped.contradiction
+        fresh = Facets(
+            Halfspaces(found.A.reshape(*shape, p + 1, p), found.b.reshape(*shape, p + 1)),
+            found.time.reshape(*shape, p + 1),
+            found.source.reshape(*shape, p + 1),
+        )
+        return replace(
+            self,
+            body=body,
+            outcome=torch.maximum(self.outcome, clipped.outcome.reshape(shape)),
+            contradiction=_choose(self.is_empty, self.contradiction, fresh),
+            last_cut=torch.where(shrunk.reshape(shape), stamp, self.last_cut),
+        )
+
+    def where(self, mask: Bool[Tensor, "*batch"], other: FeasibleSet) -> FeasibleSet:
+        """This set where `mask`, `other` elsewhere."""
+        items = (~mask).expand(self.batch_shape).reshape(-1).nonzero().squeeze(-1)
+        return replace(
+            self,
+            body=self.body.replaced(items, other.body.select(items)),
+            outcome=torch.where(mask, self.outcome, other.outcome),
+            contradiction=_choose(mask, self.contradiction, other.contradiction),
+            last_cut=torch.where(mask, self.last_cut, other.last_cut),
+        )
+
+    def emptiness(self) -> Emptiness:
+        """Is there a parameter left? With the proof, either way."""
+        sure = (self.outcome == Outcome.NONEMPTY).unsqueeze(-1)
+        return Emptiness(self.outcome, torch.where(sure, self.chebyshev()[0], float("nan")), self.contradiction)
+
+    def facets(self) -> Facets:
+        """The rows A theta <= b, none redundant beyond round-off, padded; with their time and source."""
+        shape, (A, b) = self.batch_shape, (self.body.A, self.body.b)
+        return Facets(
+            Halfspaces(A.reshape(*shape, *A.shape[1:]), b.reshape(*shape, b.shape[-1])),
+            self.body.time.reshape(*shape, -1),
+            self.body.source.reshape(*shape, -1),
+        )
+
+    def contains(self, theta: Float[Tensor, "*batch p"], tolerance: float = 1e-9) -> Bool[Tensor, "*batch"]:
+        """Is theta in the set, up to `tolerance` times its diameter (and round-off)?"""
+        margin = tolerance * self.diameter() + ROUND_OFF * theta.abs().amax(-1)
+        return (self.facets().halfspaces.slack(theta) >= -margin.unsqueeze(-1)).all(-1) & ~self.is_empty
+
+    def volume(self) -> Float[Tensor, "*batch"]:
+        """Area in the plane, length in one dimension, volume beyond; 0 for an empty set."""
+        return torch.where(self.is_empty, 0.0, self.body.volume().reshape(self.batch_shape))
+
+    def vertices(self) -> Float[Tensor, "*batch v p"]:
+        """Vertices (in the plane counter-clockwise), padded by repeating the first one."""
+        return self._batched(self.body.vertices)
+
+    def chebyshev(self) -> tuple[Float[Tensor, "*batch p"], Float[Tensor, "*batch"]]:
+        """Centre and radius of a largest inscribed ball. For elongated sets the centre jumps: see `centroid`."""
+        centre, radius = self.body.chebyshev()
+        return self._batched(centre), self._batched(radius)
+
+    def centroid(self) -> Float[Tensor, "*batch p"]:
+        """Centre of volume."""
+        return self._batched(self.body.centroid())
+
+    def diameter(self) -> Float[Tensor, "*batch"]:
+        """Largest distance between two points of the set."""
+        return self._batched(self.body.diameter())
+
+    def support(self, direction: Float[Tensor, "*batch p"]) -> Float[Tensor, "*batch"]:
+        """Support function h(n) = max n.theta over the set."""
+        flat = direction.to(torch.float64).expand(*self.batch_shape, self.dim).reshape(-1, 1, self.dim)
+        return self._batched(self.body.support(flat).squeeze(-1))
+
+    def project(
+        self, point: Float[Tensor, "*batch p"], metric: Float[Tensor, "*batch p p"] | None = None
+    ) -> Float[Tensor, "*batch p"]:
+        """The point of the set nearest to `point` in the norm sqrt(z' metric z) (default: Euclidean).
+
+        Raises:
+            InputError: `metric` is not (*batch, p, p).
+        """
+        p = self.dim
+        if metric is not None:
+            if metric.shape[-2:] != (p, p):
+                raise InputError("metric", f"(*batch, {p}, {p}), symmetric positive definite", tuple(metric.shape))
+            metric = metric.to(torch.float64).expand(*self.batch_shape, p, p).reshape(-1, p, p)
+        flat = point.to(torch.float64).expand(*self.batch_shape, p).reshape(-1, p)
+        return self._batched(self.body.nearest(flat, metric))
+
+    def _batched(self, flat: Tensor) -> Tensor:
+        return flat.reshape(*self.batch_shape, *flat.shape[1:])
+
+
+def _choose(mask: Bool[Tensor, "*batch"], mine: Facets, other: Facets) -> Facets:
+    rows = mask.unsqueeze(-1)
+    return Facets(
+        Halfspaces(
+            torch.where(rows.unsqueeze(-1), mine.halfspaces.A, other.halfspaces.A),
+            torch.where(rows, mine.halfspaces.b, other.halfspaces.b),
+        ),
+        torch.where(rows, mine.time, other.time),
+        torch.where(rows, mine.source, other.source),
+    )

@@ -1,0 +1,93 @@
+r"""Half-spaces: the one type for safe controls and for sets of parameters.
+
+    {z in R^n : A z <= b},    A (*batch, m, n),  b (*batch, m),    closed, row by row.
+
+A row 0.z <= 1 holds everywhere: it is the padding that lets ragged scenes share a batch, and the way a mask drops rows.
+Rows may carry a `source`, an integer that says which constraint each came from; it travels with them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchfsid.errors import InputError
+
+
+@dataclass(frozen=True)
+class Halfspaces:
+    """{z : A z <= b}. Tensors of any float type are cast to float64; gradients flow back through the cast.
+
+    Raises `InputError` if the last dimensions of `A` (*batch, m, n) and `b` (*batch, m) do not match.
+    """
+
+    A: Float[Tensor, "*batch m n"]
+    b: Float[Tensor, "*batch m"]
+    source: Int[Tensor, "*batch m"] | None = None
+
+    def __post_init__(self) -> None:
+        A, b = torch.as_tensor(self.A), torch.as_tensor(self.b)
+        if A.ndim < 2 or A.shape[-2] != b.shape[-1]:
+            raise InputError("Halfspaces(A, b)", "A (*batch, m, n) and b (*batch, m)", (tuple(A.shape), tuple(b.shape)))
+        try:
+            batch = torch.broadcast_shapes(A.shape[:-2], b.shape[:-1])
+        except RuntimeError as error:
+            raise InputError("Halfspaces(A, b)", "equal batch shapes", (tuple(A.shape), tuple(b.shape))) from error
+        object.__setattr__(self, "A", A.to(torch.float64).expand(*batch, *A.shape[-2:]))
+        object.__setattr__(self, "b", b.to(torch.float64).expand(*batch, b.shape[-1]))
+        if self.source is not None:
+            object.__setattr__(self, "source", self.source.expand(self.b.shape))
+
+    @classmethod
+    def stack(cls, parts: Sequence[Halfspaces]) -> Halfspaces:
+        """The intersection of several, their rows one below the other; batches broadcast."""
+        batch = torch.broadcast_shapes(*(part.batch_shape for part in parts))
+        sources = [part.source.expand(*batch, part.rows) for part in parts if part.source is not None]
+        return cls(
+            torch.cat([part.A.expand(*batch, part.rows, part.dim) for part in parts], dim=-2),
+            torch.cat([part.b.expand(*batch, part.rows) for part in parts], dim=-1),
+            torch.cat(sources, dim=-1) if len(sources) == len(parts) else None,
+        )
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        return self.b.shape[:-1]
+
+    @property
+    def rows(self) -> int:
+        return self.b.shape[-1]
+
+    @property
+    def dim(self) -> int:
+        return self.A.shape[-1]
+
+    def pullback(self, G: Float[Tensor, "*batch n p"], f: Float[Tensor, "*batch n"]) -> Halfspaces:
+        """{theta in R^p : G theta + f in this set}, i.e. A G theta <= b - A f."""
+        return Halfspaces(self.A @ G, self.b - (self.A @ f.unsqueeze(-1)).squeeze(-1), self.source)
+
+    def where(self, keep: Bool[Tensor, "*batch m"]) -> Halfspaces:
+        """The rows marked `keep`; the others become padding 0.z <= 1."""
+        return Halfspaces(torch.where(keep.unsqueeze(-1), self.A, 0.0), torch.where(keep, self.b, 1.0), self.source)
+
+    def norms(self) -> Float[Tensor, "*batch m"]:
+        """|a_j|, with 1 for padding rows, so that dividing by it is always safe (and so is its gradient)."""
+        squared = self.A.square().sum(-1)
+        padding = squared == 0
+        return torch.where(padding, 1.0, squared.masked_fill(padding, 1.0).sqrt())
+
+    def normalised(self) -> Halfspaces:
+        """The same set with unit rows (padding rows are left as they are)."""
+        norms = self.norms()
+        return Halfspaces(self.A / norms.unsqueeze(-1), self.b / norms, self.source)
+
+    def slack(self, z: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch m"]:
+        """(b_j - a_j.z)/|a_j|: the signed distance of z to each boundary, positive inside, in the units of z."""
+        return (self.b - (self.A @ z.unsqueeze(-1)).squeeze(-1)) / self.norms()
+
+    def contains(self, z: Float[Tensor, "*batch n"], tolerance: float = 0.0) -> Bool[Tensor, "*batch"]:
+        """Is z inside, up to a distance `tolerance` (units of z)?"""
+        return (self.slack(z) >= -tolerance).all(-1)

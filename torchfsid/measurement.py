@@ -1,0 +1,110 @@
+"""What the observer sees at one instant: positions and velocities, nothing else (G., Assumption 1).
+
+A batch of B robots looks at the same M bodies: slot j is body j for every robot, and a mask says which bodies are there
+and are not the robot itself. So a team of N robots is a batch of N with M = N slots, and no index list is ever needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchfsid.errors import InputError
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One instant of B robots among M bodies.
+
+    Attributes:
+        t: time [s].
+        x: positions [m].
+        u: commands executed from t on, i.e. velocities [m/s]; None before they are known (the forward model).
+        bodies: positions of whatever may have to be avoided [m].
+        present: slot j holds a body that is there at t and is not the robot itself.
+        body_velocities: the bodies' velocities at t [m/s]; NaN where unknown.
+        previous_body_velocities: their velocities one sample earlier [m/s]; NaN where unknown.
+        radius, body_radii: [m], where known.
+        observed: the robot was measured at t (None: all were). Where False, x and u are zeros, never NaN.
+    """
+
+    t: float
+    x: Float[Tensor, "*batch n"]
+    u: Float[Tensor, "*batch n"] | None
+    bodies: Float[Tensor, "*batch m n"]
+    present: Bool[Tensor, "*batch m"]
+    body_velocities: Float[Tensor, "*batch m n"] | None = None
+    previous_body_velocities: Float[Tensor, "*batch m n"] | None = None
+    radius: Float[Tensor, "*batch"] | None = None
+    body_radii: Float[Tensor, "*batch m"] | None = None
+    observed: Bool[Tensor, "*batch"] | None = None
+
+    @classmethod
+    def of_team(
+        cls,
+        t: float,
+        x: Float[Tensor, "bodies n"],
+        u: Float[Tensor, "bodies n"] | None = None,
+        *,
+        robots: Sequence[int] | None = None,
+        previous_u: Float[Tensor, "bodies n"] | None = None,
+        radius: Float[Tensor, "bodies"] | None = None,
+        seen: Bool[Tensor, "bodies"] | None = None,
+    ) -> Measurement:
+        """The batch of the inferred `robots` (indices; default all) among all bodies of a team.
+
+        `seen` marks the bodies measured at t: the others are no obstacles, and unobserved if they are robots.
+
+        Raises:
+            InputError: `x`, `u` are not (bodies, n).
+        """
+        x = torch.as_tensor(x).to(torch.float64)
+        if x.ndim != 2:
+            raise InputError("x", "positions (bodies, n)", tuple(x.shape))
+        if u is not None and u.shape != x.shape:
+            raise InputError("u", f"velocities of shape {tuple(x.shape)}", tuple(u.shape))
+        count = x.shape[0]
+        index = torch.arange(count) if robots is None else torch.as_tensor(list(robots), dtype=torch.long)
+        seen = torch.ones(count, dtype=torch.bool) if seen is None else seen
+
+        def for_each_robot(of_bodies: Tensor | None) -> Tensor | None:
+            return None if of_bodies is None else of_bodies.to(torch.float64).expand(len(index), *of_bodies.shape)
+
+        def own(of_bodies: Tensor | None) -> Tensor | None:
+            return None if of_bodies is None else of_bodies.to(torch.float64)[index]
+
+        bodies = for_each_robot(x)
+        assert bodies is not None
+        return cls(
+            t=t,
+            x=x[index],
+            u=own(u),
+            bodies=bodies,
+            present=seen & (torch.arange(count) != index.unsqueeze(-1)),
+            body_velocities=for_each_robot(u),
+            previous_body_velocities=for_each_robot(previous_u),
+            radius=own(radius),
+            body_radii=for_each_robot(radius),
+            observed=seen[index],
+        )
+
+
+class Estimate(Protocol):
+    """What every observer answers: the time [s] and a point estimate of theta."""
+
+    @property
+    def t(self) -> float: ...
+
+    @property
+    def theta(self) -> Float[Tensor, "*batch p"]: ...
+
+
+class Observer(Protocol):
+    """Measurements in, estimates out, in the order of time."""
+
+    def update(self, measurement: Measurement) -> Estimate: ...
