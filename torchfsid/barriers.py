@@ -1,6 +1,6 @@
 r"""What a robot must not do: rows A(x) u <= b(x) over its control, stacked from the barriers it uses.
 
-Avoidance of body j, with dx = x - x_j and h >= 0 the safe side (G., Eq. (5), in the units of control barrier
+Avoidance of body j, with dx = x - x_j and h >= 0 the safe side (G., Eq. (6), in the units of control barrier
 functions):
 
     squared    h = |dx|^2 - Ds^2     -2 dx.u        <= alpha(h)  [- 2 dx.u_j]
@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -27,6 +27,7 @@ from torchfsid.halfspaces import Halfspaces
 from torchfsid.measurement import Measurement
 
 
+@runtime_checkable
 class Barrier(Protocol):
     """Rows over the control u. `soft` rows may be violated by their controller (a slack variable), so a violation
     of theirs is no alarm."""

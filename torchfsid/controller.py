@@ -1,7 +1,7 @@
 r"""What a robot does: the safety QP, and the control as a differentiable function of everything it depends on.
 
-    u* = argmin |u - uhat|^2  s.t.  A u <= b,      uhat = C theta + d                       (G., Eqs. (1), (6))
-    uhat - u* = 1/2 sum_j mu_j a_j,   mu_j >= 0,   mu_j (a_j.u* - b_j) = 0                  (G., Eqs. (8)-(11))
+    u* = argmin |u - uhat|^2  s.t.  A u <= b,      uhat = C theta + d                       (G., Eq. (5))
+    uhat - u* = 1/2 sum_j mu_j a_j,   mu_j >= 0,   mu_j (a_j.u* - b_j) = 0                  (G., Eqs. (7)-(10))
 
 daqp finds the rows with positive multipliers, without gradients. The control is then recomputed from these rows alone,
 u* = (I - P) uhat + A_a^+ b_a: the same number to round-off, and differentiable in theta, positions, gains and distances
@@ -52,6 +52,7 @@ class QpSolution(NamedTuple):
     feasible: Bool[Tensor, "*batch"]
 
 
+@torch.no_grad()
 def solve_safe_qp(safe_controls: Halfspaces, uhat: Float[Tensor, "*batch n"]) -> QpSolution:
     """The control closest to `uhat` among the safe ones, by daqp, without gradients. Batches broadcast.
 
@@ -68,6 +69,7 @@ def solve_safe_qp(safe_controls: Halfspaces, uhat: Float[Tensor, "*batch n"]) ->
     unit = safe_controls.normalised()
     A = _items(unit.A, batch, (m, n))
     b = _items(unit.b, batch, (m,))
+    norms = _items(safe_controls.norms(), batch, (m,))
     nominal = _items(uhat, batch, (n,))
 
     is_row = (A != 0).any(-1)
@@ -90,18 +92,18 @@ def solve_safe_qp(safe_controls: Halfspaces, uhat: Float[Tensor, "*batch n"]) ->
         feasible[item] = flag == OPTIMAL
         u[item] = solution * speed if flag == OPTIMAL else 0.0
         if flag == OPTIMAL:
-            multipliers[item, rows] = 2 * speed * info["lam"].clip(min=0)
+            multipliers[item, rows] = 2 * speed * info["lam"].clip(min=0) / norms[item, rows]
 
     def shaped(items: np.ndarray) -> Tensor:
-        return torch.from_numpy(items).to(uhat.device).reshape(*batch, *items.shape[1:])
+        return torch.from_numpy(items).to(uhat.device).reshape((*batch, *items.shape[1:]))
 
     mu = shaped(multipliers)
-    return QpSolution(shaped(u), mu > 0, mu / safe_controls.norms().detach(), shaped(feasible))
+    return QpSolution(shaped(u), mu > 0, mu, shaped(feasible))
 
 
 def _items(values: Tensor, batch: torch.Size, shape: tuple[int, ...]) -> np.ndarray:
     """One item per leading index, for the loop over a batch."""
-    values = values.detach().to("cpu", torch.float64).expand(*batch, *shape)
+    values = values.to("cpu", torch.float64).expand(*batch, *shape)
     return values.reshape(batch.numel(), *shape).numpy()
 
 
@@ -163,10 +165,12 @@ class CbfQpController:
         safe_controls = Halfspaces.stack([barrier(measurement) for barrier in self.barriers])
         return _control(safe_controls, uhat)
 
-    def _team_control(self, measurement: Measurement, uhat: Float[Tensor, "robots n"]) -> Control:
+    def _team_control(self, measurement: Measurement, uhat: Tensor) -> Control:
         """One QP over the stacked controls. Row a.u_i - a.u_j <= b of the pair (i, j) stands in it for i and for j."""
-        if uhat.ndim != 2:
+        if uhat.ndim != 2 or uhat.shape != measurement.x.shape:
             raise InputError("measurement, theta", "one team (robots, n), for a joint QP", tuple(uhat.shape))
+        if bool(measurement.present.diagonal().any()):
+            raise InputError("measurement", "robot i to be the body in slot i, for a joint QP", "another order")
         robots, n = uhat.shape
         still = replace(measurement, body_velocities=torch.zeros_like(measurement.bodies))
         parts = [barrier(still) for barrier in self.barriers]
@@ -179,11 +183,10 @@ class CbfQpController:
                 pair_columns.append(slice(column, column + robots))
             blocks.append((share.unsqueeze(-1) * part.A.unsqueeze(-2)).flatten(-2))
             column += part.rows
-        joint = Halfspaces(
-            torch.cat(blocks, dim=1).flatten(0, 1), torch.cat([part.b for part in parts], dim=-1).flatten()
-        )
+        rows = torch.cat(blocks, dim=1).flatten(0, 1)
+        joint = Halfspaces(rows, torch.cat([part.b for part in parts], dim=-1).flatten())
         control = _control(joint, uhat.flatten())
-        active = control.active.reshape(robots, column)
+        active = control.active.reshape(robots, column).clone()
         for columns in pair_columns:
             of_pairs = active[:, columns]
             active[:, columns] = of_pairs | of_pairs.T
@@ -194,11 +197,14 @@ def _counts_current_velocities(barrier: Barrier) -> bool:
     return isinstance(barrier, CollisionAvoidance) and barrier.neighbour_velocity == "current"
 
 
-def _control(safe_controls: Halfspaces, uhat: Float[Tensor, "*batch n"]) -> Control:
+def _control(safe_controls: Halfspaces, uhat: Tensor) -> Control:
     """daqp decides which rows are active, and the KKT conditions at these rows give the control."""
     batch = torch.broadcast_shapes(safe_controls.batch_shape, uhat.shape[:-1])
     uhat = uhat.expand(*batch, uhat.shape[-1])
-    rows = Halfspaces(safe_controls.A.expand(*batch, *safe_controls.A.shape[-2:]), safe_controls.b)
+    rows = Halfspaces(
+        safe_controls.A.expand(*batch, *safe_controls.A.shape[-2:]),
+        safe_controls.b.expand(*batch, safe_controls.rows),
+    )
     _, active, _, feasible = solve_safe_qp(rows, uhat)
     # With no parameter, p = 0, and d = uhat, the offset f is the control itself.
     u = solve_kkt(rows, active, uhat.new_zeros(*uhat.shape, 0), uhat).f

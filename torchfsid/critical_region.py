@@ -3,7 +3,7 @@ r"""The paper's instantaneous feasible set Omega: every theta whose QP has the o
     inactive rows:  A_in (G theta + f) <= b_in                   (the paper's strict < is closed, here and only here)
     multipliers:    C theta + d - (G theta + f)  in  cone{a_j : j active}
 
-One formula for cases A-E (G., Eqs. (20), (25), (36), (43), (50)): the "floating" eta of cases C and E, which is
+One formula for cases A-E (G., Eqs. (19), (29), (44), (47), (54)): the "floating" eta of cases C and E, which is
 quantified by "if there exists eta", is exactly membership in this cone. It does not use the measured control, only
 which rows are active, and equals the critical region of multiparametric quadratic programming.
 """

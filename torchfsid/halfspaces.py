@@ -33,12 +33,14 @@ class Halfspaces:
         A, b = torch.as_tensor(self.A), torch.as_tensor(self.b)
         if A.ndim < 2 or A.shape[-2] != b.shape[-1]:
             raise InputError("Halfspaces(A, b)", "A (*batch, m, n) and b (*batch, m)", (tuple(A.shape), tuple(b.shape)))
-        try:
-            batch = torch.broadcast_shapes(A.shape[:-2], b.shape[:-1])
-        except RuntimeError as error:
-            raise InputError("Halfspaces(A, b)", "equal batch shapes", (tuple(A.shape), tuple(b.shape))) from error
-        object.__setattr__(self, "A", A.to(torch.float64).expand(*batch, *A.shape[-2:]))
-        object.__setattr__(self, "b", b.to(torch.float64).expand(*batch, b.shape[-1]))
+        if A.shape[:-1] != b.shape:
+            try:
+                batch = torch.broadcast_shapes(A.shape[:-2], b.shape[:-1])
+            except RuntimeError as error:
+                raise InputError("Halfspaces(A, b)", "equal batch shapes", (tuple(A.shape), tuple(b.shape))) from error
+            A, b = A.expand(*batch, *A.shape[-2:]), b.expand(*batch, b.shape[-1])
+        object.__setattr__(self, "A", A.to(torch.float64))
+        object.__setattr__(self, "b", b.to(torch.float64))
         if self.source is not None:
             object.__setattr__(self, "source", self.source.expand(self.b.shape))
 

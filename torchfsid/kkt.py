@@ -1,11 +1,11 @@
 r"""The KKT conditions of the safety QP, solved once for all of the paper's cases A-E.
 
     u* = argmin |u - uhat|^2  s.t.  A u <= b,       uhat = C theta + d,
-    uhat - u* = 1/2 sum_active mu_j a_j,  mu >= 0                                     (G., Eqs. (8)-(11), (14))
+    uhat - u* = 1/2 sum_active mu_j a_j,  mu >= 0                                     (G., Eqs. (7)-(10), (15))
 
 With A_a, b_a the active rows (the others zeroed by a mask, so that it batches) and P = A_a^+ A_a,
 
-    u*(theta) = G theta + f,   G = (I - P) C,   f = A_a^+ b_a + (I - P) d             (G., Eqs. (22), (29), (39), (46))
+    u*(theta) = G theta + f,   G = (I - P) C,   f = A_a^+ b_a + (I - P) d             (G., Eqs. (25), (36), (45), (48))
 
 and the multipliers exist exactly where  C theta + d - u*(theta)  lies in  cone{a_j : j active}. In the plane this cone
 is written by outward normals: sort the generators by angle; an angular gap of at least 180 degrees is the polar cone's

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -94,6 +94,7 @@ class Measurement:
         )
 
 
+@runtime_checkable
 class Estimate(Protocol):
     """What every observer answers: the time [s] and a point estimate of theta."""
 
@@ -104,6 +105,7 @@ class Estimate(Protocol):
     def theta(self) -> Float[Tensor, "*batch p"]: ...
 
 
+@runtime_checkable
 class Observer(Protocol):
     """Measurements in, estimates out, in the order of time."""
 

@@ -53,7 +53,16 @@ class ResultsWriter:
     def __enter__(self) -> ResultsWriter:
         self.out.mkdir(parents=True, exist_ok=True)
         p = self.observer.feasible_set.dim
-        header = ["t", "robot", "case", "n_active", *set_columns(p), *_indexed("ukf", p), *_indexed("hybrid", p), "status"]
+        header = [
+            "t",
+            "robot",
+            "case",
+            "n_active",
+            *set_columns(p),
+            *_indexed("ukf", p),
+            *_indexed("hybrid", p),
+            "status",
+        ]
         for prefix in self.others:
             header += [f"{prefix}_{name}" for name in (*set_columns(p), "status")]
         self._file = (self.out / "estimates.csv").open("w", newline="", encoding="utf-8")
@@ -65,10 +74,14 @@ class ResultsWriter:
         self._file.close()
         write_json(self.out / "regions.json", regions(self.robots, self.observer))
 
-    def write(self, measurement: Measurement, estimate: HybridEstimate, others: dict[str, SetEstimate] | None = None) -> None:
+    def write(
+        self, measurement: Measurement, estimate: HybridEstimate, others: dict[str, SetEstimate] | None = None
+    ) -> None:
         """One row per robot for the instant of `estimate`."""
         sets = estimate.set_estimate
-        measured = torch.ones(len(self.robots), dtype=torch.bool) if measurement.observed is None else measurement.observed
+        measured = (
+            torch.ones(len(self.robots), dtype=torch.bool) if measurement.observed is None else measurement.observed
+        )
         described, status = describe(sets.feasible_set), sets.status.tolist()
         extra = [(describe(other.feasible_set), other.status.tolist()) for other in (others or {}).values()]
         for i, robot in enumerate(self.robots):

@@ -1,9 +1,9 @@
 r"""A team of robots in closed loop, sampled: what an observer gets to see, with the truth beside it.
 
-    x_i(t + dt) = x_i(t) + dt u_i(t),     u_i(t) = u*(x(t); theta_i)     (explicit Euler, the control held for dt)
+    x_i(t + dt) = x_i(t) + dt u_i(t),     u_i(t) = u*(x(t); theta_i)        (G., Eqs. (4), (5), the control held for dt)
 
 All robots compute at the same time, from the positions at t. Every robot avoids every other and the obstacles, which
-stand still. Nothing is modified in place: the trajectory is differentiable in theta, start, obstacles, gains and distances.
+stand still. The trajectory is differentiable in theta, start, obstacles, gains and distances.
 """
 
 from __future__ import annotations

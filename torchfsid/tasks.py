@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -23,6 +23,7 @@ from torchfsid.measurement import Measurement
 Affine = tuple[Float[Tensor, "*batch n p"], Float[Tensor, "*batch n"]]
 
 
+@runtime_checkable
 class Task(Protocol):
     """uhat = C theta + d. `parameter_names` names the entries of theta, so p = len(parameter_names)."""
 
