@@ -32,7 +32,8 @@ class Barrier(Protocol):
     """Rows over the control u. `soft` rows may be violated by their controller (a slack variable), so a violation
     of theirs is no alarm."""
 
-    soft: bool
+    @property
+    def soft(self) -> bool: ...
 
     def __call__(self, measurement: Measurement) -> Halfspaces: ...
 

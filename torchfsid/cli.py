@@ -12,7 +12,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from torchfsid.config import ObserveConfig, load
+from torchfsid.config import ObserveConfig
+from torchfsid.documents import load
 from torchfsid.errors import FsidError
 
 if TYPE_CHECKING:

@@ -1,6 +1,5 @@
-"""YAML files to validated, frozen records, and these to the objects of the package.
+"""The sections of the configuration files, and the objects of the package that they stand for.
 
-A mistake in a file is one `ConfigError` of one line: the file, the path of the key, what was expected, what came.
 Nothing here imports torch before something is built, so that a wrong file is refused at once.
 
 `ObserveConfig` is the file of `torchfsid observe`. Other files' models are made of the same pieces: `Strict`,
@@ -9,28 +8,19 @@ Nothing here imports torch before something is built, so that a wrong file is re
 
 from __future__ import annotations
 
-import difflib
-import re
 import reprlib
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
-from pydantic_core import ErrorDetails, PydanticCustomError
+from pydantic import BeforeValidator, Field, model_validator
 
+from torchfsid.documents import Strict, wrong
 from torchfsid.errors import ConfigError
 
 if TYPE_CHECKING:
     from torchfsid.barriers import Barrier
     from torchfsid.inverse_optimal import NoiseBound
     from torchfsid.tasks import Task
-
-
-def _wrong(message: str, key: object = None) -> PydanticCustomError:
-    """An error whose message is complete; `key` is the part of the section that it is about."""
-    return PydanticCustomError("complete", "{message}", {"message": message, "key": key})
 
 
 def _number(value: object) -> object:
@@ -46,7 +36,7 @@ def _name(value: object) -> object:
     if isinstance(value, int) and not isinstance(value, bool):
         return str(value)
     if not isinstance(value, str) or not value:
-        raise _wrong(f"expected a name, got {reprlib.repr(value)} (put names in quotes)")
+        raise wrong(f"expected a name, got {reprlib.repr(value)} (put names in quotes)")
     return value
 
 
@@ -57,22 +47,6 @@ Flag = Annotated[bool, Field(strict=True)]
 BodyName = Annotated[str, BeforeValidator(_name)]
 Vector = Annotated[tuple[Number, ...], Field(min_length=1)]
 PlanarVector = Annotated[tuple[Number, ...], Field(min_length=2, max_length=2)]
-
-
-class Strict(BaseModel):
-    """A section of a file: frozen, and a key that it does not know is an error with a guess at what was meant."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _knows_its_keys(cls, data: Any) -> Any:
-        for key in data if isinstance(data, Mapping) else ():
-            if key not in cls.model_fields:
-                guess = difflib.get_close_matches(str(key), cls.model_fields, n=1)
-                hint = f"did you mean '{guess[0]}'?" if guess else f"known keys: {', '.join(cls.model_fields)}"
-                raise _wrong(f"unknown key ({hint})", key)
-        return data
 
 
 class _Task(Strict):
@@ -195,7 +169,7 @@ class AvoidanceConfig(Strict):
     @model_validator(mode="after")
     def _one_distance(self) -> AvoidanceConfig:
         if (self.safety_distance is None) == (self.margin is None):
-            raise _wrong(f"expected safety_distance or margin, got {'neither' if self.margin is None else 'both'}")
+            raise wrong(f"expected safety_distance or margin, got {'neither' if self.margin is None else 'both'}")
         return self
 
     def build(self) -> Barrier:
@@ -327,7 +301,7 @@ class ObserveConfig(Strict):
     def _prior_fits_task(self) -> ObserveConfig:
         expected, got = self.task.parameters, len(self.prior.lower)
         if got != expected:
-            raise _wrong(f"task '{self.task.kind}' has {expected} parameters, lower and upper have {got}", "prior")
+            raise wrong(f"task '{self.task.kind}' has {expected} parameters, lower and upper have {got}", "prior")
         return self
 
     @property
@@ -361,166 +335,12 @@ class ObserveConfig(Strict):
 
 def _require_box(lower: Sequence[float], upper: Sequence[float]) -> None:
     if len(lower) != len(upper):
-        raise _wrong(f"lower has {len(lower)} entries, upper has {len(upper)}")
+        raise wrong(f"lower has {len(lower)} entries, upper has {len(upper)}")
     for i, (low, high) in enumerate(zip(lower, upper, strict=True)):
         if not low < high:
-            raise _wrong(f"lower[{i}] must be less than upper[{i}], got {low} and {high}")
+            raise wrong(f"lower[{i}] must be less than upper[{i}], got {low} and {high}")
 
 
 def _require_body(path: str, name: str, bodies: Sequence[str]) -> None:
     if name not in bodies:
         raise ConfigError(f"{path}: no body is called {name!r}; there are {reprlib.repr(list(bodies))}")
-
-
-Config = TypeVar("Config", bound=Strict)
-
-
-def load(path: str | Path, model: type[Config], overrides: Iterable[str] = ()) -> Config:
-    """The file at `path`, after `overrides` such as "noise.velocity=0.02", as a `model`.
-
-    Raises:
-        ConfigError: the file cannot be read, is not YAML, or is not what `model` expects.
-    """
-    return validate(apply_overrides(read_yaml(path), overrides), model, source=str(path))
-
-
-def dump(config: Strict) -> str:
-    """The configuration with its defaults filled in, as YAML that loads back to the same configuration."""
-    content = config.model_dump(mode="json", exclude_none=True)
-    return yaml.safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None)
-
-
-def read_yaml(path: str | Path) -> dict[Any, Any]:
-    """The mapping in a YAML file, not yet validated. Raises `ConfigError`."""
-    try:
-        text = Path(path).read_bytes()
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    data = _parse(text, str(path))
-    if not isinstance(data, dict):
-        got = "nothing" if data is None else reprlib.repr(data)
-        raise ConfigError(f"{path}: expected keys and values, got {got}")
-    return data
-
-
-def apply_overrides(mapping: dict[Any, Any], overrides: Iterable[str]) -> dict[Any, Any]:
-    """A copy of a raw mapping with values replaced: "a.b=value", "barriers.0.margin=0.2"; values are YAML.
-
-    Keys that do not exist are added, and left to the validation. Raises `ConfigError` for what is not such a text.
-    """
-    for override in overrides:
-        path, equals, text = override.partition("=")
-        keys = [key.strip() for key in path.split(".")]
-        if not equals or not all(keys):
-            raise ConfigError(f"override {override!r}: expected path.to.key=value")
-        where = f"override {override!r}"
-        mapping = _replaced(mapping, keys, _parse(text, where), where)
-    return mapping
-
-
-def _replaced(node: Any, keys: list[str], value: object, where: str) -> Any:
-    """`node` with the value at `keys`, copied along the way: aliases share nodes that must not change together."""
-    if not keys:
-        return value
-    first, *rest = keys
-    if isinstance(node, list):
-        if first not in map(str, range(len(node))):
-            raise ConfigError(f"{where}: expected a number below {len(node)} in place of {first!r}")
-        i = int(first)
-        return [*node[:i], _replaced(node[i], rest, value, where), *node[i + 1 :]]
-    if node is None or isinstance(node, dict):
-        node = node or {}
-        return {**node, first: _replaced(node.get(first), rest, value, where)}
-    raise ConfigError(f"{where}: {reprlib.repr(node)} has no key {first!r}")
-
-
-def validate(mapping: Mapping[Any, Any], model: type[Config], source: str) -> Config:
-    """The mapping as a `model`. Raises `ConfigError`, which names the `source` and the path of the first mistake."""
-    try:
-        return model.model_validate(mapping)
-    except ValidationError as error:
-        first, *others = error.errors(include_url=False)
-        more = f" (and {len(others)} more)" if others else ""
-        raise ConfigError(f"{source}: {_path(first, mapping)}: {_sentence(first)}{more}") from error
-
-
-def _path(error: ErrorDetails, mapping: Mapping[Any, Any]) -> str:
-    """`barriers[0].safety_distance`. Pydantic also names the kind of a section on the way, which is no key."""
-    keys: list[Any] = []
-    node: Any = mapping
-    kind = None
-    for part in error["loc"]:
-        if kind is not None and part == kind:
-            kind = None
-            continue
-        keys.append(part)
-        try:
-            node = node[part]
-        except (KeyError, IndexError, TypeError):
-            node = None
-        kind = node.get("kind") if isinstance(node, Mapping) else None
-    context = error.get("ctx", {})
-    if error["type"] == "complete" and context["key"] is not None:
-        keys.append(context["key"])
-    if error["type"] in ("union_tag_invalid", "union_tag_not_found"):
-        keys.append("kind")
-    path = ""
-    for key in keys:
-        if isinstance(key, int):
-            path += f"[{key}]"
-        else:
-            path += ("." if path else "") + (key if isinstance(key, str) and key.isprintable() else reprlib.repr(key))
-    return path or "the file"
-
-
-def _sentence(error: ErrorDetails) -> str:
-    kind, context, got = error["type"], error.get("ctx", {}), reprlib.repr(error["input"])
-    if kind == "complete":
-        return context["message"]
-    if kind in ("missing", "union_tag_not_found"):
-        return "required key is missing"
-    if kind == "union_tag_invalid":
-        return f"expected one of {context['expected_tags']}, got {reprlib.repr(error['input']['kind'])}"
-    if kind in ("too_short", "too_long"):
-        bound = f"at least {context['min_length']}" if kind == "too_short" else f"at most {context['max_length']}"
-        return f"expected {bound} entries, got {context['actual_length']}"
-    if kind == "tuple_type":
-        return f"expected a list, got {got}"
-    if kind in ("model_type", "model_attributes_type"):
-        return f"expected keys and values, got {got}"
-    return f"{error['msg']}, got {got}"
-
-
-class _Loader(yaml.SafeLoader):
-    """YAML as `safe_load` reads it, except that a key may not be given twice, and that only plain decimal notation
-    makes a whole number: the body called 010 is not number 8."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
-        seen = set()
-        for key, _ in node.value:
-            if (key.tag, repr(key.value)) in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"key {key.value!r} is given twice", key.start_mark)
-            seen.add((key.tag, repr(key.value)))
-        return super().construct_mapping(node, deep)
-
-    def construct_decimal(self, node: yaml.ScalarNode) -> int | str:
-        text = self.construct_scalar(node)
-        return int(text) if re.fullmatch(r"0|-?[1-9][0-9]*", text) else text
-
-
-_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_decimal)
-
-
-def _parse(text: str | bytes, source: str) -> Any:
-    try:
-        return yaml.load(text, Loader=_Loader)
-    except yaml.MarkedYAMLError as error:
-        line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
-        raise ConfigError(f"{source}: {line}not valid YAML: {_one_line(error.problem or error)}") from error
-    # PyYAML also lets the errors of Python's own constructors through (!!int x, 2001-99-99, very deep nesting ...).
-    except (yaml.YAMLError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise ConfigError(f"{source}: not valid YAML: {_one_line(error)}") from error
-
-
-def _one_line(message: object) -> str:
-    return " ".join(str(message).split())

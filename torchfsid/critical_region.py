@@ -31,6 +31,7 @@ def critical_region(
     Rows that say nothing are padding. `source` is j where row j must stay inactive and m + j where its multiplier must
     not be negative. Controls are planar (n = 2); p is any.
     """
+    C, d = C.to(torch.float64), d.to(torch.float64)
     kkt = solve_kkt(safe_controls, active, C, d)
     unit = safe_controls.normalised()
     # A row inside the span of the active rows cannot see theta: u* does not move along it.

@@ -145,8 +145,8 @@ class FeasibleSet:
         found = clipped.contradiction
         fresh = Facets(
             Halfspaces(found.A.reshape(*shape, p + 1, p), found.b.reshape(*shape, p + 1)),
-            found.time.reshape(*shape, p + 1),
-            found.source.reshape(*shape, p + 1),
+            found.time.reshape((*shape, p + 1)),
+            found.source.reshape((*shape, p + 1)),
         )
         return replace(
             self,
@@ -177,8 +177,8 @@ class FeasibleSet:
         shape, (A, b) = self.batch_shape, (self.body.A, self.body.b)
         return Facets(
             Halfspaces(A.reshape(*shape, *A.shape[1:]), b.reshape(*shape, b.shape[-1])),
-            self.body.time.reshape(*shape, -1),
-            self.body.source.reshape(*shape, -1),
+            self.body.time.reshape((*shape, -1)),
+            self.body.source.reshape((*shape, -1)),
         )
 
     def contains(self, theta: Float[Tensor, "*batch p"], tolerance: float = 1e-9) -> Bool[Tensor, "*batch"]:
@@ -229,7 +229,7 @@ class FeasibleSet:
         return self._batched(self.body.nearest(flat, metric))
 
     def _batched(self, flat: Tensor) -> Tensor:
-        return flat.reshape(*self.batch_shape, *flat.shape[1:])
+        return flat.reshape((*self.batch_shape, *flat.shape[1:]))
 
 
 def _choose(mask: Bool[Tensor, "*batch"], mine: Facets, other: Facets) -> Facets:

@@ -25,9 +25,9 @@ class Halfspaces:
     Raises `InputError` if the last dimensions of `A` (*batch, m, n) and `b` (*batch, m) do not match.
     """
 
-    A: Float[Tensor, "*batch m n"]
-    b: Float[Tensor, "*batch m"]
-    source: Int[Tensor, "*batch m"] | None = None
+    A: Float[Tensor, "*#batch m n"]
+    b: Float[Tensor, "*#batch m"]
+    source: Int[Tensor, "*#batch m"] | None = None
 
     def __post_init__(self) -> None:
         A, b = torch.as_tensor(self.A), torch.as_tensor(self.b)
@@ -69,6 +69,7 @@ class Halfspaces:
 
     def pullback(self, G: Float[Tensor, "*batch n p"], f: Float[Tensor, "*batch n"]) -> Halfspaces:
         """{theta in R^p : G theta + f in this set}, i.e. A G theta <= b - A f."""
+        G, f = G.to(torch.float64), f.to(torch.float64)
         return Halfspaces(self.A @ G, self.b - (self.A @ f.unsqueeze(-1)).squeeze(-1), self.source)
 
     def where(self, keep: Bool[Tensor, "*batch m"]) -> Halfspaces:
@@ -88,7 +89,7 @@ class Halfspaces:
 
     def slack(self, z: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch m"]:
         """(b_j - a_j.z)/|a_j|: the signed distance of z to each boundary, positive inside, in the units of z."""
-        return (self.b - (self.A @ z.unsqueeze(-1)).squeeze(-1)) / self.norms()
+        return (self.b - (self.A @ z.to(torch.float64).unsqueeze(-1)).squeeze(-1)) / self.norms()
 
     def contains(self, z: Float[Tensor, "*batch n"], tolerance: float = 0.0) -> Bool[Tensor, "*batch"]:
         """Is z inside, up to a distance `tolerance` (units of z)?"""

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -56,6 +57,7 @@ def inverse_optimal_set(
 
     `source` is m + j where a half-space comes from the multiplier of row j, 2 m where no row may be active.
     """
+    u, C, d = u.to(torch.float64), C.to(torch.float64), d.to(torch.float64)
     is_row = (safe_controls.A != 0).any(-1)
     may_be_active = is_row & (safe_controls.slack(u) <= noise.slack)
     normals, generator = outward_normals(safe_controls.A, may_be_active, FAN)

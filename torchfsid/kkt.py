@@ -76,6 +76,7 @@ def solve_kkt(
         raise InputError("active", f"(*batch, {m})", tuple(active.shape))
     if C.shape[-2] != n or d.shape[-1] != n:
         raise InputError("C, d", f"C (*batch, {n}, p) and d (*batch, {n})", (tuple(C.shape), tuple(d.shape)))
+    C, d = C.to(torch.float64), d.to(torch.float64)
     unit = safe_controls.normalised()
     A = torch.where(active.unsqueeze(-1), unit.A, 0.0)
     b = torch.where(active, unit.b, 0.0)

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import torch
 
-from torchfsid.config import ObserveConfig, dump
+from torchfsid.config import ObserveConfig
+from torchfsid.documents import dump
 from torchfsid.errors import ConfigError
 from torchfsid.feasible_set import FeasibleSet
 from torchfsid.figures import draw_observation
@@ -60,8 +61,13 @@ class Observation:
             raise ConfigError("task: planar controllers only, but the log has a column z")
         if config.velocity == "logged" and self.log.u is None:
             raise ConfigError("velocity: 'logged', but the log has no columns vx, vy (use 'differentiated')")
-        if config.uses_radius and self.log.radius is None:
+        margins = [b.margin for b in config.barriers if b.kind == "avoidance" and b.margin is not None]
+        if margins and self.log.radius is None:
             raise ConfigError("barriers: a margin needs the radii, but the log has no column radius")
+        if margins and self.log.radius is not None and min(margins) + sorted(self.log.radius)[0] <= 0:
+            raise ConfigError("barriers: a margin of 0 needs positive radii")
+        if len(self.log.bodies) > 1 and not (self.log.seen.sum(axis=1) > 1).any():
+            raise ConfigError(f"{self.log.source}: no two bodies share a time, so none would ever see another")
         if config.velocity == "differentiated":
             self.log = self.log.differentiated()
         self.robots = config.robots(self.log.bodies)
@@ -95,9 +101,10 @@ class Observation:
 
     def run(self, out: Path) -> Iterator[float]:
         """Observe the whole log into the folder `out`, yielding the time of each sample done; the figure comes last."""
+        measurements = self.log.measurements(self.robots, self.config.neighbour_velocities, self.config.required)
         with ResultsWriter(out, self.robots, self.sets) as results:
             (out / "config.yaml").write_text(dump(self.config), encoding="utf-8")
-            for measurement in self.log.measurements(self.robots, self.config.neighbour_velocities):
+            for measurement in measurements:
                 estimate = self.hybrid.update(measurement)
                 results.write(measurement, estimate)
                 informative = estimate.set_estimate.informative.tolist()

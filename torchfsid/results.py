@@ -107,8 +107,11 @@ def describe(sets: FeasibleSet) -> list[list[str]]:
 
 
 def regions(robots: Sequence[str], observer: SetMembershipObserver) -> dict:
-    """The final sets, as regions.json holds them. `last_cut` is null where the set never shrank, and `facets` tells when
-    and from which constraint each row came (`source` as in `critical_region` and `inverse_optimal_set`; -1: the prior)."""
+    """The final sets, as regions.json holds them.
+
+    `last_cut` is null where the set never shrank; `facets` tells when and from which constraint each row came (`source`
+    as in `critical_region` and `inverse_optimal_set`; -1: the prior).
+    """
     sets = observer.feasible_set
     facets, (centre, radius) = sets.facets(), sets.chebyshev()
     rows, vertices = facets.halfspaces, sets.vertices()

@@ -125,8 +125,9 @@ class ParameterUkf:
         except RuntimeError as error:
             raise InputError("spread", f"a shape that fits {tuple(self.mean.shape)}", tuple(spread.shape)) from error
         noises = (self.position_noise, self.process_noise, self.motion_noise, self.active_tolerance)
-        if not (self.position_noise > 0 and min(noises) >= 0 and math.isfinite(sum(noises))):
-            raise InputError("noises", "position_noise > 0, the others >= 0", noises)
+        positive = self.position_noise > 0 and self.active_tolerance > 0
+        if not (positive and min(noises) >= 0 and math.isfinite(sum(noises))):
+            raise InputError("noises", "position_noise > 0, active_tolerance > 0, the others >= 0", noises)
         self._theta = self.mean.detach().to(torch.float64).numpy().copy()
         self._covariance = self._scale[:, :, None] ** 2 * np.eye(p)
         self.filters = [None] * len(self.mean)
@@ -204,9 +205,9 @@ class ParameterUkf:
         if measurement.observed is not None:
             known = known & measurement.observed
         safe_controls = rows.where(known.unsqueeze(-1))
-        C = torch.where(known[:, None, None], C, 0.0)
-        d = torch.where(known[:, None], d, 0.0)
-        u = torch.where(known[:, None], measurement.u, 0.0)
+        C = torch.where(known[:, None, None], C, 0.0).to(torch.float64)
+        d = torch.where(known[:, None], d, 0.0).to(torch.float64)
+        u = torch.where(known[:, None], measurement.u, 0.0).to(torch.float64)
         slack = safe_controls.slack(u)
         failed = (u == 0).all(-1) & (slack < 0).any(-1)
         known = (known & ~failed & (slack >= -self.active_tolerance).all(-1)).tolist()

@@ -1,0 +1,103 @@
+"""Table I, measured, as a figure: for each case its rows, what was learned, and how fast."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Polygon, Rectangle
+
+from experiments.config import CasesConfig
+from experiments.figures.drawing import add_goal, add_region
+from experiments.figures.style import ACTIVE, CURVES, INVERSE_OPTIMAL, REGION, ROBOT, SET_COLOURS, UKF
+from experiments.lengths import lengths
+from experiments.saved import Region, Results
+
+SHADOW = 20.0
+"""How far the forbidden side of a row is drawn, in units of the panel [m/s]."""
+
+
+def draw_cases(results: Results, config: CasesConfig) -> Figure:
+    """A column per case: the rows over the control half-way through, the final sets over the goal, lengths over time."""
+    count = len(config.cases)
+    figure = Figure(figsize=(1.62 * count + 0.6, 6.3), layout="constrained")
+    axes = figure.subplots(3, count, height_ratios=(1, 1, 0.9))
+    half_way, measures, measured = len(results.t) // 2, lengths(results), results.summary["cases"]
+    reach = 1.15 * max(np.abs([*region.u, *region.nominal]).max() for region in results.regions[half_way])
+    for i, case in enumerate(config.cases):
+        _draw_rows(axes[0, i], results.regions[half_way][i], reach)
+        _draw_sets(axes[1, i], results, i)
+        _draw_lengths(axes[2, i], results.t, {name: values[:, i] for name, values in measures.items()})
+        axes[0, i].set_title(case.name, fontweight="bold", loc="center")
+        axes[1, i].set_title(_verdict(measured[i]), loc="center", fontsize=8)
+        axes[2, i].sharey(axes[2, 0])
+        for axis in axes[:, i] if i else ():
+            axis.tick_params(labelleft=False)
+    axes[0, 0].set_ylabel("$u_y$ [m/s]")
+    axes[1, 0].set_ylabel("goal y [m]")
+    axes[2, 0].set_ylabel("[m]")
+    figure.suptitle(
+        f"{config.title}: can a point estimator learn, does the paper's region shrink (in brackets: the paper's answer)",
+        fontsize=9,
+        x=0.01,
+        ha="left",
+    )
+    handles = [
+        Line2D([], [], color=ACTIVE, lw=1.8),
+        Line2D([], [], color="0.65", lw=0.9),
+        Line2D([], [], color="black", ls="", marker="o", mfc="white", ms=5.5),
+        Line2D([], [], color=ROBOT, ls="", marker="o", ms=5.5),
+        Line2D([], [], color="black", ls="", marker="*", ms=9),
+        Line2D([], [], color=UKF, ls="", marker="x", ms=6, mew=1.6),
+        Patch(facecolor="#BFE7DC", edgecolor=REGION),
+        Patch(facecolor="none", edgecolor=INVERSE_OPTIMAL),
+    ]
+    labels = ["active row", "inactive row", "nominal control", "control", "goal", "UKF", "paper's region", "inverse-optimal set"]
+    lines, names = axes[2, 0].get_legend_handles_labels()
+    figure.legend([*handles, *lines], [*labels, *names], loc="outside lower center", ncols=7, columnspacing=1.4)
+    return figure
+
+
+def _verdict(measured: dict[str, Any]) -> str:
+    point, region = ((measured[f"{what}_measured"], measured[f"{what}_paper"]) for what in ("point", "region"))
+    return f"point {point[0]} ({point[1]})\nregion {region[0]} ({region[1]})"
+
+
+def _draw_rows(axes: Axes, region: Region, reach: float) -> None:
+    """The plane of controls: rows with their forbidden sides, where the goal pulls, and what the robot does."""
+    on = np.abs(region.rows[:, :2] @ region.u - region.rows[:, 2]) < 1e-6
+    for (a_x, a_y, b), active in zip(region.rows, on, strict=True):
+        normal, along, far = np.array([a_x, a_y]), np.array([-a_y, a_x]), SHADOW * reach
+        edge = np.array([b * normal - far * along, b * normal + far * along])
+        axes.add_patch(Polygon([*edge, *(edge[::-1] + far * normal)], facecolor="0.2" if active else "0.6", alpha=0.13, lw=0))
+        axes.plot(*edge.T, color=ACTIVE if active else "0.65", lw=1.8 if active else 0.9, zorder=2)
+    axes.plot(*np.array([region.nominal, region.u]).T, color="0.3", lw=0.8, ls=(0, (2, 1.5)), zorder=3)
+    axes.plot(*region.nominal, "o", color="black", mfc="white", ms=5.5, zorder=4)
+    axes.plot(*region.u, "o", color=ROBOT, mec="white", mew=0.6, ms=6.5, zorder=5)
+    axes.plot(0, 0, "+", color="0.4", ms=6, mew=0.8)
+    axes.set(xlim=(-0.6 * reach, reach), ylim=(-0.8 * reach, 0.8 * reach), aspect="equal", xlabel="$u_x$ [m/s]")
+
+
+def _draw_sets(axes: Axes, results: Results, i: int) -> None:
+    """The plane of goals: what is left of the prior at the end."""
+    (left, bottom), (right, top) = np.array(results.config.prior.lower), np.array(results.config.prior.upper)
+    axes.add_patch(Rectangle((left, bottom), right - left, top - bottom, fill=False, ec="0.6", lw=0.8))
+    for kind, filled in (("critical_region", True), ("inverse_optimal", False)):
+        add_region(axes, results.regions[-1][i].vertices[kind], SET_COLOURS[kind], filled=filled)
+    path = results.numbers("ukf_0", "ukf_1")[:, i]
+    axes.plot(*path.T, color=UKF, lw=1.0, zorder=6)
+    axes.plot(*path[-1], "x", color=UKF, ms=6, mew=1.6, zorder=8)
+    add_goal(axes, results.goals[i])
+    margin = 0.06 * (right - left)
+    axes.set(xlim=(left - margin, right + margin), ylim=(bottom - margin, top + margin), aspect="equal", xlabel="goal x [m]")
+
+
+def _draw_lengths(axes: Axes, t: np.ndarray, measures: dict[str, np.ndarray]) -> None:
+    for curve in CURVES:
+        values = measures[curve.measure]
+        axes.semilogy(t, np.where(values > 0, values, np.nan), label=curve.label, **curve.looks)
+    axes.grid(True)
+    axes.set(xlabel="t [s]", xlim=(t[0], t[-1]))

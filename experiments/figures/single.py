@@ -1,0 +1,161 @@
+"""The paper's figure of a scene with one robot: snapshots, under each the whole region, and the comparison of errors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.legend_handler import HandlerTuple
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
+
+from experiments.config import SceneConfig
+from experiments.figures.drawing import (
+    add_goal,
+    add_obstacles,
+    add_region,
+    add_robot,
+    darken,
+    disc_radius,
+    frame,
+    map_frame,
+    padded,
+)
+from experiments.figures.style import (
+    ACTIVE,
+    CURVES,
+    HYBRID,
+    INACTIVE,
+    INVERSE_OPTIMAL,
+    REGION,
+    ROBOT,
+    SET_COLOURS,
+    UKF,
+    length,
+)
+from experiments.lengths import lengths
+from experiments.saved import Results
+
+ASPECT = 1.25
+"""Width / height of the maps."""
+
+
+def draw_single(results: Results, config: SceneConfig) -> Figure:
+    samples = [results.at(t) for t in config.snapshots]
+    count = len(samples)
+    figure = Figure(figsize=(2.45 * count + 3.6, 4.9), layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.04, h_pad=0.04, wspace=0.03, hspace=0.03)  # type: ignore[union-attr]
+    grid = figure.add_gridspec(2, count + 1, width_ratios=[*[2.45] * count, 3.2])
+    box = map_frame(results, config, ASPECT)
+    for column, k in enumerate(samples):
+        above, below = figure.add_subplot(grid[0, column]), figure.add_subplot(grid[1, column])
+        _draw_map(above, results, config, k, box)
+        above.set_title(f"({chr(ord('a') + column)})  t = {results.t[k]:.2f} s", fontweight="bold")
+        _draw_region(below, results, k, box)
+        if column == 0:
+            above.set_ylabel("y [m]")
+            below.set_ylabel("y − goal [m]")
+    right = grid[:, count].subgridspec(2, 1, height_ratios=(7, 1))
+    errors = figure.add_subplot(right[0])
+    strip = figure.add_subplot(right[1], sharex=errors)
+    draw_errors(errors, results, samples)
+    errors.set_title(f"({chr(ord('a') + count)})  sizes and errors [m]", fontweight="bold", pad=13)
+    draw_strip(strip, results)
+    figure.suptitle(f"{config.title}   {_settings(config)}", fontsize=9, x=0.01, ha="left")
+    _add_legends(figure, errors)
+    return figure
+
+
+def _draw_map(axes: Axes, results: Results, config: SceneConfig, k: int, box: tuple[np.ndarray, np.ndarray]) -> None:
+    region, path = results.regions[k][0], results.paths[config.robots[0].name]
+    add_region(axes, region.vertices["critical_region"], REGION, filled=True)
+    discs = add_obstacles(axes, config)
+    darken(axes, discs, config, region.active)
+    axes.plot(*path[: k + 1].T, color=ROBOT, lw=1.1, zorder=4.5)
+    add_robot(axes, path[k], disc_radius(config), ROBOT)
+    add_goal(axes, results.goals[0])
+    _add_estimates(axes, results, k, np.zeros(2))
+    frame(axes, box)
+    axes.set_xlabel("x [m]")
+
+
+def _draw_region(axes: Axes, results: Results, k: int, box: tuple[np.ndarray, np.ndarray]) -> None:
+    """The whole region about the goal, to its own scale; a dashed frame is the map's."""
+    region, goal = results.regions[k][0], results.goals[0]
+    for kind, filled in (("critical_region", True), ("inverse_optimal", False)):
+        drawn = add_region(axes, region.vertices[kind] - goal, SET_COLOURS[kind], filled=filled)
+        if not filled:
+            drawn.set(linestyle=(0, (3, 2)), zorder=1.5)
+    add_goal(axes, (0.0, 0.0))
+    _add_estimates(axes, results, k, goal)
+    vertices = np.vstack([region.vertices["critical_region"] - goal, np.zeros((1, 2))])
+    frame(axes, padded(vertices.min(0), vertices.max(0), ASPECT, 1.25))
+    (left, bottom), (right, top) = box - goal
+    axes.add_patch(Rectangle((left, bottom), right - left, top - bottom, fill=False, ec="0.45", lw=0.7, ls=(0, (1, 1.5))))
+    axes.set_xlabel("x − goal [m]")
+    axes.locator_params(nbins=5)
+    for kind, side in (("critical_region", "left"), ("inverse_optimal", "right")):
+        size = length(np.sqrt(results.of_set(kind, "volume")[k, 0]))
+        axes.set_title(f"√area {size}", loc=side, color=SET_COLOURS[kind], fontsize=8)
+
+
+def _add_estimates(axes: Axes, results: Results, k: int, origin: np.ndarray) -> None:
+    """The filter's path and where it is now, and the hybrid estimate, clipped to the frame."""
+    ukf = results.numbers("ukf_0", "ukf_1")[: k + 1, 0] - origin
+    hybrid = results.numbers("hybrid_0", "hybrid_1")[k, 0] - origin
+    axes.plot(*ukf.T, color=UKF, lw=1.1, zorder=6)
+    axes.plot(*ukf[-1], "x", color=UKF, ms=6.5, mew=1.8, zorder=8)
+    axes.plot(*hybrid, "D", color=HYBRID, ms=7.5, mfc="none", mew=1.4, zorder=7.5)
+
+
+def draw_errors(axes: Axes, results: Results, samples: list[int]) -> None:
+    measures = lengths(results)
+    for curve in CURVES:
+        values = measures[curve.measure][:, 0]
+        axes.semilogy(results.t, np.where(values > 0, values, np.nan), label=curve.label, **curve.looks)
+    for column, k in enumerate(samples):
+        axes.axvline(results.t[k], color="0.6", lw=0.7, ls=(0, (1, 1.5)), zorder=0)
+        letter = f"({chr(ord('a') + column)})"
+        axes.text(results.t[k], 1.0, letter, transform=axes.get_xaxis_transform(), ha="center", va="bottom", fontsize=7, color="0.4")
+    axes.grid(True)
+    axes.tick_params(labelbottom=False)
+    axes.set_xlim(results.t[0], results.t[-1])
+
+
+def draw_strip(axes: Axes, results: Results) -> None:
+    """How many rows are active, over time."""
+    active = results.n_active()[:, 0]
+    axes.fill_between(results.t, active, step="post", color=ACTIVE, alpha=0.75, lw=0)
+    top = max(2, int(active.max()))
+    axes.set(xlabel="t [s]", ylabel="active", ylim=(0, top + 0.3), yticks=range(top + 1))
+
+
+def _settings(config: SceneConfig) -> str:
+    lower, upper = (", ".join(f"{x:g}" for x in corner) for corner in (config.prior.lower, config.prior.upper))
+    return (
+        f"dt = {config.dt:g} s, prior [{lower}] to [{upper}] m, UKF: √R = {length(config.ukf.position_noise)}, "
+        f"inverse-optimal bound {config.noise.velocity:g} m/s"
+    )
+
+
+def _add_legends(figure: Figure, errors: Axes) -> None:
+    def marker(shape: str, colour: str, **looks: Any) -> Line2D:
+        return Line2D([], [], ls="", marker=shape, color=colour, **looks)
+
+    obstacles = tuple(marker("o", colour, ms=8, mec="0.4") for colour in (ACTIVE, INACTIVE))
+    entries = [
+        (marker("o", ROBOT, ms=9), "robot"),
+        (marker("*", "black", ms=10), "goal"),
+        (obstacles, "obstacle: active, inactive"),
+        (Rectangle((0, 0), 1, 1, fill=False, ec="0.45", ls=(0, (1, 1.5))), "frame of the map above"),
+        (Patch(facecolor="#BFE7DC", edgecolor=REGION), "paper's region"),
+        (Patch(facecolor="none", edgecolor=INVERSE_OPTIMAL, ls=(0, (3, 2))), "inverse-optimal set"),
+        (marker("x", UKF, ms=7, mew=1.8), "UKF"),
+        (marker("D", HYBRID, ms=6.5, mfc="none", mew=1.4), "hybrid estimate"),
+    ]
+    handles, labels = zip(*entries, strict=True)
+    looks = {"handler_map": {tuple: HandlerTuple(None)}, "columnspacing": 1.6}
+    figure.legend(handles, labels, loc="outside lower left", ncols=len(entries) // 2, **looks)
+    figure.legend(*errors.get_legend_handles_labels(), loc="outside lower right", ncols=3, columnspacing=1.0, handlelength=2)

@@ -1,0 +1,69 @@
+"""How the figures look: Okabe and Ito's colours, which the colour-blind can tell apart, and one kind of line per thing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+STYLE: dict[str, Any] = {
+    "font.size": 8.5,
+    "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
+    "axes.labelsize": 8.5,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "grid.color": "0.92",
+    "grid.linewidth": 0.6,
+    "xtick.labelsize": 7.5,
+    "ytick.labelsize": 7.5,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "lines.solid_capstyle": "round",
+    "mathtext.fontset": "dejavusans",
+    "savefig.dpi": 200,
+    "pdf.fonttype": 42,
+}
+
+ROBOT = "#D55E00"
+REGION = "#009E73"
+INVERSE_OPTIMAL = "#0072B2"
+UKF = "#CC79A7"
+HYBRID = "#E69F00"
+ACTIVE, INACTIVE = "0.25", "0.82"
+TEAM = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F5539", "#4D4D4D")
+"""One colour per robot, reused in turn beyond eight."""
+
+SET_COLOURS = {"critical_region": REGION, "inverse_optimal": INVERSE_OPTIMAL}
+SET_NAMES = {"critical_region": "paper's region Θ", "inverse_optimal": "inverse-optimal set"}
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A line in the comparison of errors: its name in `experiments.lengths.lengths`, its label, its looks."""
+
+    measure: str
+    label: str
+    looks: dict[str, Any]
+
+
+CURVES = (
+    Curve("critical_region sqrt_area", "region √area", {"color": REGION, "lw": 1.6}),
+    Curve("critical_region diameter", "region diameter", {"color": REGION, "lw": 1.1, "ls": (0, (4, 1.5))}),
+    Curve("inverse_optimal sqrt_area", "inv.-opt. √area", {"color": INVERSE_OPTIMAL, "lw": 1.6}),
+    Curve("inverse_optimal diameter", "inv.-opt. diameter", {"color": INVERSE_OPTIMAL, "lw": 1.1, "ls": (0, (4, 1.5))}),
+    Curve("ukf", "UKF error", {"color": UKF, "lw": 1.8}),
+    Curve("hybrid", "hybrid error", {"color": HYBRID, "lw": 1.4, "ls": (0, (1, 1))}),
+)
+
+
+UNITS = ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm"), (1e-9, "nm"))
+
+
+def length(metres: float) -> str:
+    """A length as people write it: 14 m, 0.11 m, 3.2 mm, 1.1 µm."""
+    unit, name = next((unit for unit in UNITS if metres >= 0.1 * unit[0]), UNITS[-1])
+    return f"{metres / unit:.2g} {name}"

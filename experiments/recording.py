@@ -1,0 +1,97 @@
+"""A recording: what an observer will see of some robots, with the truth beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from experiments.config import SceneConfig
+from torchfsid.barriers import Barrier
+from torchfsid.controller import CbfQpController
+from torchfsid.measurement import Measurement
+from torchfsid.simulation import Trajectory, simulate
+from torchfsid.tasks import Task
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Measurements of a batch of robots, in the order of time.
+
+    Attributes:
+        robots: their names. goals: the truth [m].
+        task, barriers: the model, which is also what the observers assume.
+        row_names: for each row of the barriers, the body that it avoids or the row's label.
+        samples: how many `measurements` there are.
+    """
+
+    robots: list[str]
+    goals: Float[Tensor, "B 2"]
+    task: Task
+    barriers: list[Barrier]
+    row_names: list[str]
+    measurements: Iterator[Measurement]
+    samples: int
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A simulated scene: the true trajectory, and what is measured of it."""
+
+    config: SceneConfig
+    task: Task
+    barriers: list[Barrier]
+    true: Trajectory
+    measured: Trajectory
+
+    def recording(self) -> Recording:
+        labels = [label for barrier in self.barriers for label in barrier.labels(self.config.bodies)]
+        return Recording(
+            robots=[robot.name for robot in self.config.robots],
+            goals=_points([robot.goal for robot in self.config.robots]),
+            task=self.task,
+            barriers=self.barriers,
+            row_names=[label.removeprefix("avoid ") for label in labels],
+            measurements=self.measured.measurements(),
+            samples=len(self.measured.t),
+        )
+
+
+def simulate_scene(config: SceneConfig) -> Scene:
+    """Run the scene's robots in closed loop, and measure them as well as the config says."""
+    task = config.task.build(config.bodies)
+    barriers: list[Barrier] = [barrier.build() for barrier in config.barriers]
+    true = simulate(
+        CbfQpController(task, barriers),
+        _points([robot.goal for robot in config.robots]),
+        _points([robot.start for robot in config.robots]),
+        dt=config.dt,
+        steps=config.steps,
+        obstacles=_points([obstacle.position for obstacle in config.obstacles]),
+    )
+    return Scene(config, task, barriers, true, _measured(true, config))
+
+
+def _measured(true: Trajectory, config: SceneConfig) -> Trajectory:
+    """The trajectory with errors on the robots' positions and velocities; obstacles are known exactly."""
+    random = np.random.default_rng(np.random.SeedSequence(config.seed))
+    noise = config.measurement_noise
+    x, u = true.x.clone(), true.u.clone()
+    x[:, : true.robots] += _in_disc(random, noise.position, (len(true.t), true.robots))
+    u[:, : true.robots] += _in_disc(random, noise.velocity, (len(true.t), true.robots))
+    return replace(true, x=x, u=u)
+
+
+def _in_disc(random: np.random.Generator, radius: float, shape: tuple[int, ...]) -> Tensor:
+    """Points uniformly distributed in a disc."""
+    distance = radius * np.sqrt(random.uniform(size=shape))
+    angle = random.uniform(0, 2 * np.pi, size=shape)
+    return torch.from_numpy(np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=-1))
+
+
+def _points(points: list[tuple[float, ...]]) -> Float[Tensor, "points 2"]:
+    return torch.tensor(points, dtype=torch.float64).reshape(-1, 2)

@@ -1,0 +1,82 @@
+"""What a run counts as it goes on, because only then both the sets and the truth are at hand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchfsid.feasible_set import FeasibleSet
+from torchfsid.hybrid import HybridEstimate
+from torchfsid.observer import SetEstimate
+
+ROUND_OFF = 1e-9
+"""Relative change of an area that is round-off."""
+
+
+@dataclass
+class SetTally:
+    """Counts of steps, per robot, for one kind of set.
+
+    Attributes:
+        volume: at the last step, at first the prior's.
+        outside: the truth was not in the set. grew, shrank: the area did.
+        ukf_outside: the filter's estimate was not in the set.
+    """
+
+    volume: Float[Tensor, "B"]
+    outside: Int[Tensor, "B"] = field(init=False)
+    grew: Int[Tensor, "B"] = field(init=False)
+    shrank: Int[Tensor, "B"] = field(init=False)
+    ukf_outside: Int[Tensor, "B"] = field(init=False)
+
+    def __post_init__(self) -> None:
+        nothing = torch.zeros(self.volume.shape, dtype=torch.long)
+        self.outside, self.grew, self.shrank, self.ukf_outside = nothing, nothing, nothing, nothing
+
+    def update(self, sets: FeasibleSet, goals: Float[Tensor, "B 2"], ukf: Float[Tensor, "B 2"]) -> None:
+        volume = sets.volume()
+        self.outside = self.outside + ~sets.contains(goals)
+        self.ukf_outside = self.ukf_outside + ~sets.contains(ukf)
+        self.grew = self.grew + (volume > self.volume * (1 + ROUND_OFF))
+        self.shrank = self.shrank + (volume < self.volume * (1 - ROUND_OFF))
+        self.volume = volume
+
+
+@dataclass
+class Tally:
+    """Counts of a run over both kinds of set, and how much its motions depended on the parameter.
+
+    Attributes:
+        goals: the truth [m].
+        sets: by the name of the kind.
+        samples: so far.
+        information: sum of G'G dt, whose rank is the number of directions in which a motion can show the parameter.
+        rank: the largest rank of G at any step.
+        prior_covariance, covariance: the filter's, of the parameter, before the first and after the last sample.
+    """
+
+    goals: Float[Tensor, "B 2"]
+    sets: dict[str, SetTally]
+    prior_covariance: Float[Tensor, "B 2 2"]
+    covariance: Float[Tensor, "B 2 2"] = field(init=False)
+    samples: int = 0
+    information: Float[Tensor, "B 2 2"] = field(init=False)
+    rank: Int[Tensor, "B"] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.covariance = self.prior_covariance
+        self.information = torch.zeros_like(self.prior_covariance)
+        self.rank = torch.zeros(len(self.goals), dtype=torch.long)
+
+    def update(self, estimate: HybridEstimate, sets: dict[str, SetEstimate], dt: float) -> None:
+        ukf = estimate.ukf_estimate
+        for kind, of_kind in sets.items():
+            self.sets[kind].update(of_kind.feasible_set, self.goals, ukf.theta)
+        kkt = estimate.set_estimate.kkt
+        self.information = self.information + kkt.G.mT @ kkt.G * dt
+        self.rank = torch.maximum(self.rank, kkt.G.shape[-2] - kkt.rank)
+        self.covariance = ukf.covariance
+        self.samples += 1

@@ -1,0 +1,163 @@
+"""Theta(t) keeps its promises (check 5): truth inside, volume never grows; the facet cap, provenance, emptiness."""
+
+import math
+
+import pytest
+import torch
+
+from torchfsid.clipping import Outcome
+from torchfsid.errors import InputError
+from torchfsid.feasible_set import MAX_FACETS, FeasibleSet
+from torchfsid.halfspaces import Halfspaces
+
+TRUTH = {1: [0.3], 2: [0.3, -1.2], 3: [0.3, -1.2, 0.8], 4: [0.3, -1.2, 0.8, 0.1]}
+
+
+def box(p: int, batch: int = 3, **options: int) -> FeasibleSet:
+    return FeasibleSet.from_box(torch.full((batch, p), -2.0), torch.full((batch, p), 2.0), **options)
+
+
+def around(truth: torch.Tensor, rows: int, width: float, generator: torch.Generator) -> Halfspaces:
+    """Random half-spaces whose boundaries pass within `width` of a truth they contain."""
+    A = torch.randn(*truth.shape[:-1], rows, truth.shape[-1], generator=generator, dtype=torch.float64)
+    margin = width * torch.rand(A.shape[:-1], generator=generator, dtype=torch.float64)
+    return Halfspaces(A, (A @ truth.unsqueeze(-1)).squeeze(-1) + margin * A.norm(dim=-1))
+
+
+@pytest.mark.parametrize("p", [1, 2, 3, 4])
+def test_truth_stays_inside_and_volume_never_grows(p: int) -> None:
+    generator = torch.Generator().manual_seed(p)
+    truth = torch.tensor(TRUTH[p], dtype=torch.float64).expand(3, p)
+    theta, volume = box(p), torch.full((3,), 4.0**p, dtype=torch.float64)
+    for k in range(25):
+        theta = theta.intersect(around(truth, 4, 0.85**k, generator), time=0.1 * k)
+        smaller = theta.volume()
+        assert theta.contains(truth).all()
+        assert (smaller <= volume * (1 + 1e-12)).all()
+        assert (theta.outcome == Outcome.NONEMPTY).all()
+        volume = smaller
+    assert (volume < 0.5 * 4.0**p).all()
+
+
+def regular(sides: int, turn: float) -> Halfspaces:
+    angles = 2 * math.pi * torch.arange(sides, dtype=torch.float64) / sides + turn
+    return Halfspaces(torch.stack([angles.cos(), angles.sin()], dim=-1), torch.ones(sides, dtype=torch.float64))
+
+
+def test_facets_are_capped_outward_at_less_than_one_percent() -> None:
+    """Tangents of the unit circle in ever new directions: the set tends to the disc, whatever the number of steps."""
+    capped, free = box(2, batch=1), box(2, batch=1, max_facets=10_000)
+    previous = capped.volume()
+    for k in range(60):
+        rows = regular(7, 0.37 * k)
+        capped, free = capped.intersect(rows), free.intersect(rows)
+        assert capped.volume() <= previous
+        previous = capped.volume()
+        assert (
+            capped.facets().halfspaces.where(capped.facets().halfspaces.A.abs().sum(-1) > 0).rows <= capped.body.slots
+        )
+        assert int(capped.body.count) <= MAX_FACETS
+    assert int(free.body.count) > 100
+    inside = free.vertices()[0]
+    assert bool((capped.facets().halfspaces.slack(inside.unsqueeze(0).transpose(0, 1)) >= -1e-12).all())
+    assert free.volume() <= capped.volume() <= 1.01 * free.volume()
+
+
+def test_memory_does_not_grow_with_the_steps() -> None:
+    generator = torch.Generator().manual_seed(0)
+    truth = torch.zeros(2, 2, dtype=torch.float64)
+    theta, slots = box(2, batch=2), 0
+    for _ in range(400):
+        theta = theta.intersect(around(truth, 6, 0.5, generator))
+        slots = max(slots, theta.body.slots)
+    assert slots <= 2 * MAX_FACETS
+
+
+def test_a_facet_knows_when_and_whence_it_came() -> None:
+    theta = box(2, batch=1)
+    east = Halfspaces(torch.tensor([[1.0, 0.0]]), torch.tensor([1.0]), source=torch.tensor([7]))
+    theta = theta.intersect(east, time=0.5)
+    facets = theta.facets()
+    new = (facets.source == 7).squeeze(0)
+    assert int(new.sum()) == 1
+    assert facets.time[0, new].item() == 0.5
+    assert facets.halfspaces.b[0, new].item() == 1.0
+    assert theta.last_cut.item() == 0.5
+    unchanged = theta.intersect(Halfspaces(torch.tensor([[1.0, 0.0]]), torch.tensor([1.5])), time=0.7)
+    assert unchanged.last_cut.item() == 0.5
+    assert (facets.source[0, ~new] == -1).all()
+
+
+@pytest.mark.parametrize("p", [1, 2, 3])
+def test_emptiness_comes_with_rows_that_contradict(p: int) -> None:
+    """Item 0 is cut to nothing in two steps, item 1 is not: one bad item does not touch the other."""
+    axis = torch.eye(p, dtype=torch.float64)[:1].expand(2, 1, p)
+    first = Halfspaces(axis, torch.tensor([[-1.0], [1.0]]))
+    second = Halfspaces(-axis, torch.tensor([[0.5], [0.5]]))
+    theta = box(p, batch=2).intersect(first, time=1.0).intersect(second, time=2.0)
+    verdict = theta.emptiness()
+    assert verdict.outcome.tolist() == [Outcome.EMPTY, Outcome.NONEMPTY]
+    assert theta.volume()[0] == 0
+    assert not theta.contains(torch.zeros(p, dtype=torch.float64).expand(2, p))[0]
+    assert bool(theta.contains(verdict.witness)[1])
+    rows = verdict.contradiction
+    blamed = {time for time in rows.time[0].tolist() if not math.isnan(time)}
+    assert blamed == {1.0, 2.0}
+    assert rows.halfspaces.A[1].isnan().all()
+
+    again = theta.intersect(Halfspaces(axis, torch.tensor([[10.0], [10.0]])), time=3.0)
+    assert again.is_empty.tolist() == [True, False]
+    kept = theta.where(~theta.is_empty, box(p, batch=2))
+    assert kept.volume().tolist() == pytest.approx([4.0**p, 1.5 * 4.0 ** (p - 1)])
+
+
+def test_touching_is_undecided_and_stays_in() -> None:
+    """x <= -2 meets the box [-2, 2]^2 in an edge: neither surely empty nor of any size."""
+    theta = box(2, batch=1).intersect(Halfspaces(torch.tensor([[1.0, 0.0]]), torch.tensor([-2.0])))
+    assert theta.emptiness().outcome.item() == Outcome.UNDECIDED
+    assert theta.volume().item() == 16.0
+    assert theta.emptiness().witness.isnan().all()
+
+
+def test_batch_shapes_and_questions_agree_with_single_sets() -> None:
+    generator = torch.Generator().manual_seed(3)
+    truth = torch.zeros(2, 3, 2, dtype=torch.float64)
+    rows = around(truth, 5, 1.0, generator)
+    prior = FeasibleSet.from_box(torch.full((2, 3, 2), -2.0), torch.full((2, 3, 2), 2.0))
+    together = prior.intersect(rows)
+    direction = torch.randn(2, 3, 2, generator=generator, dtype=torch.float64)
+    point = 3 * torch.randn(2, 3, 2, generator=generator, dtype=torch.float64)
+    for i in range(2):
+        for j in range(3):
+            alone = FeasibleSet.from_box(torch.full((2,), -2.0), torch.full((2,), 2.0))
+            alone = alone.intersect(Halfspaces(rows.A[i, j], rows.b[i, j]))
+            assert alone.volume() == pytest.approx(together.volume()[i, j].item(), rel=1e-12)
+            assert torch.allclose(alone.centroid(), together.centroid()[i, j], atol=1e-12)
+            assert torch.allclose(alone.chebyshev()[1], together.chebyshev()[1][i, j], atol=1e-12)
+            assert torch.allclose(alone.support(direction[i, j]), together.support(direction)[i, j], atol=1e-12)
+            assert torch.allclose(alone.project(point[i, j]), together.project(point)[i, j], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "expected"),
+    [
+        ([0.0, 1.0], [1.0, 1.0], "lower < upper"),
+        ([0.0], [1.0, 1.0], r"\(\*batch, p\)"),
+        ([0.0, float("nan")], [1.0, 1.0], "lower < upper"),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_wrong_priors_are_refused(lower: list[float], upper: list[float], expected: str) -> None:
+    with pytest.raises(InputError, match=expected):
+        FeasibleSet.from_box(torch.tensor(lower), torch.tensor(upper))
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_wrong_halfspaces_are_refused() -> None:
+    theta = box(2)
+    with pytest.raises(InputError, match="R\\^2"):
+        theta.intersect(Halfspaces(torch.ones(1, 3), torch.ones(1)))
+    with pytest.raises(InputError, match="NaN"):
+        theta.intersect(Halfspaces(torch.tensor([[1.0, float("nan")]]), torch.ones(1)))
+    with pytest.raises(InputError, match="metric"):
+        theta.project(torch.zeros(3, 2), torch.ones(3, 3))

@@ -1,0 +1,209 @@
+"""Check 8: first and second derivatives against finite differences, with padding, ties and orthogonal equal rows.
+
+Where a quantity has a kink (tied rows) gradcheck has no answer to compare with: there the gradients are checked by sums
+that any one-sided choice must have, or along parameters that move the tied rows together.
+"""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from tests.problems import CASES, paper_case, random_scene
+from torch import Tensor
+from torch.autograd import gradcheck, gradgradcheck
+
+from torchfsid.barriers import ClassK, CollisionAvoidance
+from torchfsid.clipping import clip
+from torchfsid.critical_region import critical_region
+from torchfsid.halfspaces import Halfspaces
+from torchfsid.inverse_optimal import NoiseBound, inverse_optimal_set
+from torchfsid.measurement import Measurement
+from torchfsid.polygon import Polygon
+from torchfsid.tasks import GoalTask
+
+OUTSIDE = torch.tensor([[4.0, 3.5], [-3.0, 5.0]], dtype=torch.float64).repeat(100, 1)
+DIRECTIONS = torch.tensor([[[0.6, 0.8]], [[-1.0, 0.3]]], dtype=torch.float64).repeat(100, 1, 1)
+METRIC = torch.tensor([[2.0, 0.7], [0.7, 1.0]], dtype=torch.float64).repeat(200, 1, 1)
+
+
+def measures(polygon: Polygon) -> tuple[Tensor, ...]:
+    """Everything that is asked of a polygon; in one function, so that each finite difference costs one clip."""
+    B = len(polygon.count)
+    return (
+        polygon.volume(), polygon.centroid(), *polygon.chebyshev(), polygon.diameter(), polygon.support(DIRECTIONS[:B]),
+        polygon.nearest(OUTSIDE[:B]), polygon.nearest(OUTSIDE[:B], METRIC[:B]),
+    )  # fmt: skip
+
+
+def clipped_box(A: Tensor, b: Tensor) -> Polygon:
+    half = torch.full((len(b), 2), 2.0, dtype=torch.float64)
+    time = torch.zeros(len(b), dtype=torch.float64)
+    return clip(Polygon.from_box(-half, half), A, b, time, torch.zeros(b.shape, dtype=torch.long)).body
+
+
+def ragged_rows() -> tuple[Tensor, Tensor]:
+    """Two polygons of 7 and 3 edges; a padding row, a redundant row and a cut-away corner."""
+    pi = math.pi
+    angles = torch.tensor([[0.3, 1.1, 2.4, 3.9, 5.0], [0.5, 0.5 + 2 * pi / 3, 0.4 + 4 * pi / 3, 1.0, 2.0]])
+    A = torch.stack([angles.cos(), angles.sin()], dim=-1).double() * torch.tensor([1, 3, 0.5, 2, 1]).unsqueeze(-1)
+    b = A.norm(dim=-1) * torch.tensor([[1.0, 1.2, 1.9, 2.4, 1.9], [0.6, 0.7, 0.8, 9.0, 9.0]])
+    A[1, 4], b[1, 4] = 0.0, 1.0
+    return A.requires_grad_(), b.requires_grad_()
+
+
+def test_measures_of_a_clipped_box():
+    A, b = ragged_rows()
+    assert clipped_box(A, b).count.tolist() == [7, 3]
+
+    assert gradcheck(lambda A, b: measures(clipped_box(A, b)), (A, b))
+    assert gradgradcheck(lambda A, b: measures(clipped_box(A, b)), (A, b))
+
+
+def test_orthogonal_equal_rows_turned_by_45_degrees():
+    """Where the derivative of an SVD is wrong or NaN."""
+    A = torch.tensor([[[1.0, 1.0], [1.0, -1.0]]], dtype=torch.float64).mul(math.sqrt(0.5)).requires_grad_()
+    b = torch.tensor([[0.7, 0.8]], dtype=torch.float64, requires_grad=True)
+
+    assert gradcheck(lambda A, b: measures(clipped_box(A, b)), (A, b))
+    assert gradgradcheck(lambda A, b: measures(clipped_box(A, b)), (A, b))
+
+
+def test_tied_rows_that_move_together():
+    """Every row three times, at different scales: as a function of the one row behind them, nothing has a kink."""
+    A, b = ragged_rows()
+    scale = torch.tensor([1.0, 3.0, 0.7]).repeat_interleave(5).double()
+
+    def tripled(A: Tensor, b: Tensor) -> tuple[Tensor, ...]:
+        return measures(clipped_box(A.repeat(1, 3, 1) * scale.unsqueeze(-1), b.repeat(1, 3) * scale))
+
+    assert gradcheck(tripled, (A, b))
+    assert gradgradcheck(tripled, (A, b))
+
+
+def test_tied_rows_share_their_gradient():
+    """d(area)/db over rows on one line sums to the edge's length; four edges that touch the disc share a radius of 1."""
+    A = torch.tensor([[1.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], dtype=torch.float64).unsqueeze(0)
+    b = torch.ones(1, 5, dtype=torch.float64, requires_grad=True)
+    square = clipped_box(A, b)
+    (of_area,) = torch.autograd.grad(square.volume().sum(), b, retain_graph=True)
+    assert of_area[0, :2].sum() == pytest.approx(2.0)
+    (of_radius,) = torch.autograd.grad(square.chebyshev()[1].sum(), b)
+    assert of_radius.sum() == pytest.approx(1.0)
+    assert of_radius.min() >= 0
+
+
+def test_nearest_point_and_metric():
+    polygon = clipped_box(*ragged_rows())
+    inputs = OUTSIDE[:2].clone().requires_grad_(), METRIC[:2].clone().requires_grad_()
+    assert gradcheck(polygon.nearest, inputs)
+    inner = torch.zeros(2, 2, dtype=torch.float64, requires_grad=True)
+    jacobian = torch.autograd.functional.jacobian(polygon.nearest, inner)
+    assert torch.equal(jacobian[0, :, 0], torch.eye(2, dtype=torch.float64))
+
+
+# The sets -----------------------------------------------------------------------------------------------------------
+
+
+ON_ONE_LINE = ("C same side", "C opposite", "E half-plane")
+
+
+def region_rows(A: Tensor, b: Tensor, active: Tensor, C: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
+    region = critical_region(Halfspaces(A, b), active, C, d)
+    return region.A, region.b
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_critical_region(case: str):
+    """With respect to A, b, C, d; but to A not where rows lie on one line, since there the set is not continuous in A."""
+    scene = paper_case(case, np.random.default_rng(4))
+    A, active, b, C, d = (torch.from_numpy(part) for part in (scene.A, scene.active, scene.b, scene.C, scene.d))
+    inputs = (
+        A.requires_grad_(case not in ON_ONE_LINE),
+        b.requires_grad_(),
+        active,
+        C.requires_grad_(),
+        d.requires_grad_(),
+    )
+    assert gradcheck(region_rows, inputs)
+    assert gradgradcheck(region_rows, inputs)
+
+
+def test_critical_region_at_orthogonal_equal_rows():
+    A = torch.tensor([[1.0, 1.0], [1.0, -1.0], [0.3, 1.0]], dtype=torch.float64, requires_grad=True)
+    b = torch.tensor([0.5, 0.5, 4.0], dtype=torch.float64, requires_grad=True)
+    C, d = torch.eye(2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
+    active = torch.tensor([True, True, False])
+    assert gradcheck(lambda A, b: region_rows(A, b, active, C, d), (A, b))
+    assert gradgradcheck(lambda A, b: region_rows(A, b, active, C, d), (A, b))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_inverse_optimal_set(case: str):
+    """With respect to the control, the task and, where the set is continuous in them, the rows."""
+    scene = paper_case(case, np.random.default_rng(5))
+    A, b, u, C, d = (torch.from_numpy(part) for part in (scene.A, scene.b, scene.u, scene.C, scene.d))
+    if case not in ON_ONE_LINE:
+        A.requires_grad_()
+
+    def rows(A: Tensor, u: Tensor, C: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
+        safe = inverse_optimal_set(Halfspaces(A, b), u, C, d, NoiseBound(0.05))
+        return safe.A, safe.b
+
+    assert gradcheck(rows, (A, u.requires_grad_(), C.requires_grad_(), d.requires_grad_()))
+    assert gradgradcheck(rows, (A, u, C, d))
+
+
+def scene_of_positions(x: Tensor, bodies: Tensor, present: Tensor) -> tuple[Halfspaces, Tensor, Tensor]:
+    measurement = Measurement(t=0.0, x=x, u=None, bodies=bodies, present=present)
+    safe_controls = CollisionAvoidance(ClassK(1.5), safety_distance=0.5)(measurement)
+    return safe_controls, *GoalTask(0.8)(measurement)
+
+
+@pytest.mark.parametrize("kind", ["critical region", "inverse optimal"])
+def test_area_as_a_function_of_positions_and_control(kind: str):
+    """The whole chain, from where the bodies are to the area of the set; one slot of the bodies is empty."""
+    x = torch.tensor([[0.1, -0.2]], dtype=torch.float64, requires_grad=True)
+    places = [[[1.2, 0.4], [0.9, -1.1], [-2.0, 0.5], [0.0, 0.0]]]
+    bodies = torch.tensor(places, dtype=torch.float64, requires_grad=True)
+    present = torch.tensor([[True, True, True, False]])
+    active = torch.tensor([[True, True, False, False]])
+    safe_controls, _, _ = scene_of_positions(x, bodies, present)
+    u = torch.linalg.solve(safe_controls.A[:, :2], safe_controls.b[:, :2]).detach().requires_grad_()
+
+    def area(x: Tensor, bodies: Tensor, u: Tensor) -> Tensor:
+        safe_controls, C, d = scene_of_positions(x, bodies, present)
+        if kind == "critical region":
+            theta = critical_region(safe_controls, active, C, d)
+        else:
+            theta = inverse_optimal_set(safe_controls, u, C, d, NoiseBound(0.05))
+        half = torch.full((1, 2), 6.0, dtype=torch.float64)
+        source = torch.zeros(theta.b.shape, dtype=torch.long)
+        return clip(
+            Polygon.from_box(-half, half), theta.A, theta.b, torch.zeros(1, dtype=torch.float64), source
+        ).body.volume()
+
+    assert 1 < area(x, bodies, u) < 100
+    assert gradcheck(area, (x, bodies, u))
+    assert gradgradcheck(area, (x, bodies, u))
+
+
+def test_gradients_of_random_scenes_are_finite():
+    """200 scenes in one batch, ragged by padding, every measure, both sets."""
+    rng, count, rows = np.random.default_rng(6), 200, 8
+    scenes = [random_scene(rng, int(rng.integers(1, rows + 1))) for _ in range(count)]
+    A, b = torch.zeros(count, rows, 2, dtype=torch.float64), torch.ones(count, rows, dtype=torch.float64)
+    active = torch.zeros(count, rows, dtype=torch.bool)
+    for i, scene in enumerate(scenes):
+        m = len(scene.b)
+        A[i, :m], b[i, :m], active[i, :m] = map(torch.from_numpy, (scene.A, scene.b, scene.active))
+    u, C, d = (torch.from_numpy(np.stack([getattr(scene, part) for scene in scenes])) for part in ("u", "C", "d"))
+    leaves = [leaf.requires_grad_() for leaf in (A, b, u, C, d)]
+    safe_controls = Halfspaces(A, b)
+    sets = critical_region(safe_controls, active, C, d), inverse_optimal_set(safe_controls, u, C, d, NoiseBound(0.1))
+    for theta in sets:
+        polygon = clipped_box(theta.A / 5, theta.b / 5 - (theta.A @ torch.ones(2).double()) / 50)
+        for measure in measures(polygon):
+            gradients = torch.autograd.grad(measure.sum(), leaves, retain_graph=True, allow_unused=True)
+            assert all(gradient is None or gradient.isfinite().all() for gradient in gradients)
+            assert any(gradient is not None and gradient.abs().max() > 0 for gradient in gradients)

@@ -1,0 +1,459 @@
+"""The unscented Kalman filter on [x; theta]: against a plain Kalman filter, and whatever data may bring."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from torchfsid.barriers import ClassK, CollisionAvoidance, SpeedBox
+from torchfsid.controller import CbfQpController
+from torchfsid.errors import InputError, SolverError
+from torchfsid.measurement import Measurement
+from torchfsid.simulation import Trajectory, simulate
+from torchfsid.tasks import GoalTask, UnknownGainGoalTask, VelocityTask
+from torchfsid.ukf import FLOOR, FilterStatus, ParameterUkf
+
+# Two pairs of obstacles, one pair active until 1.1 s and the other until 2.1 s, then none.
+TASK = GoalTask(1.8605)
+BARRIERS = [CollisionAvoidance(ClassK(1.1544), safety_distance=0.3688)]
+GOAL = torch.tensor([[3.5250, -0.0689]], dtype=torch.float64)
+OBSTACLES = torch.tensor([[0.9215, 0.6738], [0.9215, -0.6738], [2.5677, 1.2122], [2.5677, -1.2122]])
+# Four robots that cross each other's way.
+TEAM_TASK = GoalTask(0.8434)
+TEAM_BARRIERS = [CollisionAvoidance(ClassK(1.5704), safety_distance=0.3515)]
+TEAM_GOALS = torch.tensor([[-1.7208, 0.0952], [0.1176, -1.671], [1.6816, -0.2556], [0.0068, 1.6019]]).double()
+TEAM_STARTS = torch.tensor([[0.6138, -0.5031], [0.1617, 1.0376], [-0.9789, 0.0649], [0.3538, -1.0515]])
+
+
+@pytest.fixture(scope="module")
+def two_pairs() -> Trajectory:
+    start = torch.zeros(1, 2)
+    return simulate(CbfQpController(TASK, BARRIERS), GOAL, start, obstacles=OBSTACLES, dt=0.05, steps=52)
+
+
+@pytest.fixture(scope="module")
+def team() -> Trajectory:
+    return simulate(CbfQpController(TEAM_TASK, TEAM_BARRIERS), TEAM_GOALS, TEAM_STARTS, dt=0.05, steps=50)
+
+
+def box(robots: int, half: float = 6.0, p: int = 2) -> tuple[Tensor, Tensor]:
+    upper = torch.full((robots, p), half, dtype=torch.float64)
+    return -upper, upper
+
+
+def lost(measurement: Measurement, robots: Sequence[int]) -> Measurement:
+    """The measurement without some robots, as a log gives it: zeros, never NaN."""
+    assert measurement.u is not None
+    observed = torch.ones(len(measurement.x), dtype=torch.bool)
+    observed[list(robots)] = False
+    keep = observed.unsqueeze(-1)
+    return replace(measurement, x=measurement.x * keep, u=measurement.u * keep, observed=observed)
+
+
+def free_run(steps: int, dt: float = 0.02, goal: Tensor | None = None) -> Iterator[Measurement]:
+    """A robot with nothing in its way."""
+    goal = torch.tensor([[2.0, -1.0]], dtype=torch.float64) if goal is None else goal
+    x = torch.zeros_like(goal)
+    for k in range(steps):
+        u = goal - x
+        yield Measurement(k * dt, x, u, torch.full((1, 1, 2), 50.0).double(), torch.ones(1, 1, dtype=torch.bool))
+        x = x + dt * u
+
+
+def free_ukf(**settings: float | bool) -> ParameterUkf:
+    return ParameterUkf.from_prior(GoalTask(1.0), BARRIERS, *box(1), **settings)
+
+
+def kalman_filter(
+    team: Trajectory, robot: int, samples: Sequence[int], spread: float, noises: dict[str, float]
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Theta's mean and covariance by the textbook's five equations; active sets from the simulation itself."""
+    R, walk, drift = (noises[f"{name}_noise"] ** 2 for name in ("position", "motion", "process"))
+    H, identity = np.eye(2, 4), np.eye(4)
+    state = np.concatenate([team.x[samples[0], robot].numpy(), np.zeros(2)])
+    P = np.diag([R, R, spread**2, spread**2])
+    history = [(state[2:], P[2:, 2:])]
+    for k, following in pairwise(samples):
+        dt = float(team.t[following] - team.t[k])
+        x, u = team.x[k, robot].numpy(), team.u[k, robot].numpy()
+        rows = team.x[k, team.active[k, robot]].numpy() - x
+        span = np.linalg.pinv(rows) @ rows
+        free = (np.eye(2) - span) * TEAM_TASK.gain
+        F = identity.copy()
+        F[:2, 2:] = dt * free
+        state = F @ state + np.concatenate([dt * (span @ u - free @ x), np.zeros(2)])
+        P = F @ P @ F.T + dt * np.diag([walk, walk, drift, drift])
+        K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R * np.eye(2))
+        state = state + K @ (team.x[following, robot].numpy() - H @ state)
+        P = (identity - K @ H) @ P
+        history.append((state[2:], P[2:, 2:]))
+    return history
+
+
+# The linear model ---------------------------------------------------------------------------------------------------
+
+
+def test_equals_a_plain_kalman_filter(team: Trajectory) -> None:
+    """At irregular times, through all active sets of four robots."""
+    assert len(team.active.flatten(0, 1).unique(dim=0)) > 5
+    samples = sorted(np.random.default_rng(1).choice(51, 35, replace=False).tolist())
+    noises = {"position_noise": 0.02, "motion_noise": 0.003, "process_noise": 0.01}
+    ukf = ParameterUkf(TEAM_TASK, TEAM_BARRIERS, torch.zeros(4, 2), 3.0, **noises)
+    estimates = [ukf.update(team.measurement(k)) for k in samples]
+    assert all(bool((estimate.status == FilterStatus.OK).all()) for estimate in estimates[1:])
+    for robot in range(4):
+        history = kalman_filter(team, robot, samples, 3.0, noises)
+        for estimate, (theta, covariance) in zip(estimates, history, strict=True):
+            np.testing.assert_allclose(estimate.theta[robot], theta, atol=1e-8)
+            np.testing.assert_allclose(estimate.covariance[robot], covariance, atol=1e-8)
+
+
+def test_learns_nothing_while_two_rows_are_active(two_pairs: Trajectory) -> None:
+    """G = 0: the mean stands still, the covariance grows by the drift, until the robot is free."""
+    ukf = ParameterUkf.from_prior(TASK, BARRIERS, *box(1), process_noise=0.1)
+    for measurement in two_pairs.measurements():
+        estimate = ukf.update(measurement)
+        if measurement.t < 2.0:
+            drift = 0.1**2 * measurement.t
+            torch.testing.assert_close(estimate.theta, torch.zeros(1, 2).double(), atol=1e-12, rtol=0)
+            expected = (12**2 / 12 + drift) * torch.eye(2).double().unsqueeze(0)
+            torch.testing.assert_close(estimate.covariance, expected, atol=1e-12, rtol=1e-12)
+    assert (estimate.theta - GOAL).norm() < 1e-3
+
+
+def test_without_process_noise_only_the_floor_is_added(two_pairs: Trajectory) -> None:
+    ukf = ParameterUkf.from_prior(TASK, BARRIERS, *box(1), process_noise=0.0, motion_noise=0.0)
+    for k in range(40):
+        estimate = ukf.update(two_pairs.measurement(k))
+    assert estimate.covariance[0].diagonal().sub(12.0).abs().max() < 12.0 * (51 * FLOOR**2 + 1e-13)
+
+
+@pytest.mark.parametrize("qp_inside", [False, True])
+def test_converges_where_nothing_is_active(qp_inside: bool) -> None:
+    ukf = free_ukf(qp_inside=qp_inside)
+    errors = [(ukf.update(measurement).theta - torch.tensor([[2.0, -1.0]])).norm() for measurement in free_run(40)]
+    assert errors[0] > 2.0
+    assert errors[5] < 1e-2
+    assert errors[-1] < 1e-4
+
+
+def test_the_covariance_means_what_it_says() -> None:
+    """With goals and noises as declared, the normalised error squared averages p = 2."""
+    generator = torch.Generator().manual_seed(3)
+    robots, dt = 100, 0.05
+    noises = {"position_noise": 0.01, "motion_noise": 0.005, "process_noise": 0.0}
+    ukf = ParameterUkf(GoalTask(1.0), BARRIERS, torch.zeros(robots, 2), 3.0, **noises)
+    goals = 3.0 * torch.randn(robots, 2, generator=generator, dtype=torch.float64)
+    x = torch.zeros(robots, 2).double()
+    far_away = torch.full((robots, 1, 2), 90.0).double(), torch.ones(robots, 1, dtype=torch.bool)
+    for k in range(6):
+        z = x + 0.01 * torch.randn(robots, 2, generator=generator, dtype=torch.float64)
+        estimate = ukf.update(Measurement(k * dt, z, goals - z, *far_away))
+        walk = 0.005 * math.sqrt(dt) * torch.randn(robots, 2, generator=generator, dtype=torch.float64)
+        x = x + dt * (goals - z) + walk
+    error = (estimate.theta - goals).unsqueeze(-1)
+    squared = (error.mT @ torch.linalg.inv(estimate.covariance) @ error).flatten()
+    assert 1.5 < squared.mean() < 2.5
+
+
+def test_unknown_gain() -> None:
+    """Three parameters, bilinear in the goal and the gain: (k, k x_d)."""
+    truth = torch.tensor([[0.8, 1.6, -0.8]], dtype=torch.float64)
+    task = UnknownGainGoalTask()
+    run = simulate(CbfQpController(task, [SpeedBox((9.0, 9.0))]), truth, torch.tensor([[-1.0, 0.5]]), dt=0.05, steps=80)
+    ukf = ParameterUkf.from_prior(task, [SpeedBox((9.0, 9.0))], *box(1, 4.0, p=3))
+    for measurement in run.measurements():
+        estimate = ukf.update(measurement)
+    torch.testing.assert_close(estimate.theta, truth, atol=1e-2, rtol=0)
+
+
+# The QP inside ------------------------------------------------------------------------------------------------------
+
+
+def test_qp_inside_learns_through_changes_of_the_active_set(two_pairs: Trajectory) -> None:
+    """Before the robot is free, when the other mode has learned nothing (see above), and after."""
+    assert len(two_pairs.active.unique(dim=0)) > 2
+    ukf = ParameterUkf.from_prior(TASK, BARRIERS, *box(1), qp_inside=True)
+    estimates = [ukf.update(two_pairs.measurement(k)) for k in range(53)]
+    assert all(estimate.status.item() == FilterStatus.OK for estimate in estimates[1:])
+    assert (estimates[20].theta - GOAL).norm() < 0.5 * GOAL.norm()
+    assert estimates[20].covariance[0].diagonal().amin() < 0.5 * 12
+    assert (estimates[-1].theta - GOAL).norm() < 0.05
+
+
+def test_a_solver_that_fails_leaves_the_motion_unknown(monkeypatch: pytest.MonkeyPatch) -> None:
+    ukf = free_ukf(qp_inside=True)
+    first, second, third = free_run(3)
+    before = ukf.update(first)
+
+    def fails(*_: object) -> None:
+        raise SolverError("no solution, no certificate")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("torchfsid.ukf.solve_safe_qp", fails)
+        estimate = ukf.update(second)
+    assert estimate.status.item() == FilterStatus.PREDICTED
+    torch.testing.assert_close(estimate.theta, before.theta, atol=0, rtol=0)
+    assert ukf.update(third).status.item() == FilterStatus.OK
+
+
+# What data may bring ------------------------------------------------------------------------------------------------
+
+
+def test_a_lost_measurement_says_nothing(team: Trajectory) -> None:
+    """Theta's mean stays and its covariance drifts, at the loss and at the next position, whose past is unknown."""
+    ukf = ParameterUkf.from_prior(TEAM_TASK, TEAM_BARRIERS, *box(4), process_noise=0.1)
+    for k in range(10):
+        before = ukf.update(team.measurement(k))
+    missed = ukf.update(lost(team.measurement(10), [1]))
+    again = ukf.update(team.measurement(11))
+    resumed = ukf.update(team.measurement(12))
+    assert missed.status.tolist() == again.status.tolist() == [0, FilterStatus.PREDICTED, 0, 0]
+    assert resumed.status.tolist() == [0, 0, 0, 0]
+    for steps, estimate in enumerate((missed, again), start=1):
+        torch.testing.assert_close(estimate.theta[1], before.theta[1], atol=0, rtol=0)
+        expected = before.covariance[1] + steps * 0.05 * 0.1**2 * torch.eye(2).double()
+        torch.testing.assert_close(estimate.covariance[1], expected, atol=1e-12, rtol=1e-12)
+
+
+def test_learns_between_losses() -> None:
+    ukf = free_ukf()
+    for k, measurement in enumerate(free_run(60)):
+        estimate = ukf.update(lost(measurement, [0]) if k % 3 == 0 else measurement)
+        assert estimate.status.item() == (FilterStatus.OK if k % 3 == 2 else FilterStatus.PREDICTED)
+    torch.testing.assert_close(estimate.theta, torch.tensor([[2.0, -1.0]]).double(), atol=1e-3, rtol=0)
+
+
+def test_a_robot_that_appears_late() -> None:
+    ukf = free_ukf(process_noise=0.5)
+    estimates = [ukf.update(lost(m, [0]) if k < 5 else m) for k, m in enumerate(free_run(30))]
+    statuses = [estimate.status.item() for estimate in estimates]
+    assert statuses == [FilterStatus.PREDICTED] * 6 + [FilterStatus.OK] * 24
+    torch.testing.assert_close(estimates[4].covariance[0], (12 + 0.5**2 * 0.08) * torch.eye(2).double())
+    assert (estimates[-1].theta - torch.tensor([[2.0, -1.0]])).norm() < 0.2
+
+
+def unreadable(kind: str, measurement: Measurement) -> Measurement:
+    assert measurement.u is not None
+    zero = torch.zeros_like(measurement.bodies)
+    if kind == "neighbour's velocity unknown":
+        return replace(measurement, previous_body_velocities=zero.fill_(math.nan))
+    measurement = replace(measurement, previous_body_velocities=zero)
+    near = measurement.x.unsqueeze(1) + torch.tensor([0.3, 0.0])
+    if kind == "row violated":
+        return replace(measurement, bodies=near)
+    if kind == "controller failed":
+        return replace(measurement, bodies=near, u=torch.zeros_like(measurement.u))
+    if kind == "velocity not finite":
+        return replace(measurement, u=measurement.u * math.nan)
+    return measurement
+
+
+@pytest.mark.parametrize("qp_inside", [False, True])
+@pytest.mark.parametrize(
+    "kind", ["neighbour's velocity unknown", "row violated", "controller failed", "velocity not finite"]
+)
+def test_an_unreadable_motion_says_nothing(kind: str, qp_inside: bool) -> None:
+    """The position itself counts still; it is the next one whose motion is not known."""
+    barriers = [replace(BARRIERS[0], neighbour_velocity="previous")]
+    ukf = ParameterUkf.from_prior(GoalTask(1.0), barriers, *box(1), qp_inside=qp_inside)
+    estimates = [
+        ukf.update(unreadable(kind if k == 3 else "none", measurement)) for k, measurement in enumerate(free_run(8))
+    ]
+    statuses = [estimate.status.item() for estimate in estimates]
+    assert statuses == [1, 0, 0, 0, 1, 0, 0, 0]
+    torch.testing.assert_close(estimates[4].theta, estimates[3].theta, atol=0, rtol=0)
+
+
+@pytest.mark.parametrize("broken", [-np.eye(4), np.diag([1.0, 1.0, 1.0, -1e-3]), np.ones((4, 4)), np.zeros((4, 4))])
+def test_a_covariance_that_is_not_definite_is_repaired(broken: np.ndarray) -> None:
+    ukf = free_ukf()
+    run = free_run(60)
+    for _ in range(3):
+        ukf.update(next(run))
+    kalman = ukf.filters[0]
+    assert kalman is not None
+    kalman.P = broken
+    estimate = ukf.update(next(run))
+    assert estimate.status.item() == FilterStatus.REPAIRED
+    torch.linalg.cholesky(estimate.covariance)
+    assert ukf.update(next(run)).status.item() == FilterStatus.OK
+
+
+def test_a_covariance_lost_to_round_off_is_repaired() -> None:
+    """A position noise of 1e-9 m against a prior of 1e6 m: the first update cancels all digits of the covariance."""
+    ukf = ParameterUkf(GoalTask(1.0), BARRIERS, torch.zeros(1, 2), 1e6, position_noise=1e-9, motion_noise=0.0)
+    estimates = [ukf.update(measurement) for measurement in free_run(20)]
+    assert any(estimate.status.item() == FilterStatus.REPAIRED for estimate in estimates)
+    for estimate in estimates:
+        torch.linalg.cholesky(estimate.covariance)
+    assert (estimates[-1].theta - torch.tensor([[2.0, -1.0]])).norm() < 1e-3
+
+
+@pytest.mark.parametrize("qp_inside", [False, True])
+@pytest.mark.parametrize("seed", range(4))
+def test_no_data_make_it_raise(qp_inside: bool, seed: int) -> None:
+    """Garbage in positions and velocities: the estimates stay finite and their covariances definite."""
+    rng = np.random.default_rng([seed, 7])
+    barriers = [*BARRIERS, replace(BARRIERS[0], distance="euclidean"), SpeedBox((5.0, 5.0))]
+    ukf = ParameterUkf.from_prior(TASK, barriers, *box(3), qp_inside=qp_inside, process_noise=0.0)
+    garbage = np.array([0.0, math.nan, math.inf, -math.inf, 1e300, 1e160, -1e99, 1e30, 1e-300])
+
+    def drawn(*shape: int) -> Tensor:
+        values = np.where(rng.random(shape) < 0.08, rng.choice(garbage, shape), rng.normal(size=shape))
+        return torch.from_numpy(values)
+
+    t = 0.0
+    for _ in range(40):
+        t += rng.choice([1e-9, 0.02, 3.0, 1e6])
+        present = torch.from_numpy(rng.random((3, 4)) < 0.8)
+        observed = torch.from_numpy(rng.random(3) < 0.8)
+        estimate = ukf.update(Measurement(t, drawn(3, 2), drawn(3, 2), drawn(3, 4, 2), present, observed=observed))
+        assert bool(estimate.theta.isfinite().all())
+        torch.linalg.cholesky(estimate.covariance)
+
+
+# Interface ----------------------------------------------------------------------------------------------------------
+
+
+def test_batch_equals_loop(team: Trajectory) -> None:
+    robots = [0, 1, 2, 3]
+    together = ParameterUkf.from_prior(TEAM_TASK, TEAM_BARRIERS, *box(4))
+    alone = [ParameterUkf.from_prior(TEAM_TASK, TEAM_BARRIERS, *box(1)) for _ in robots]
+    for k in range(0, 50, 3):
+        measurement = team.measurement(k)
+        estimate = together.update(measurement)
+        for i in robots:
+            u = None if measurement.u is None else measurement.u[[i]]
+            of_one = Measurement(
+                measurement.t, measurement.x[[i]], u, measurement.bodies[[i]], measurement.present[[i]]
+            )
+            torch.testing.assert_close(alone[i].update(of_one).theta[0], estimate.theta[i], atol=1e-10, rtol=0)
+
+
+@pytest.mark.parametrize("qp_inside", [False, True])
+def test_a_pickled_observer_goes_on(team: Trajectory, qp_inside: bool) -> None:
+    ukf = ParameterUkf.from_prior(TEAM_TASK, TEAM_BARRIERS, *box(4), qp_inside=qp_inside)
+    for k in range(5):
+        ukf.update(team.measurement(k))
+    copy = pickle.loads(pickle.dumps(ukf))
+    for k in range(5, 10):
+        mine, theirs = ukf.update(team.measurement(k)), copy.update(team.measurement(k))
+        torch.testing.assert_close(mine.theta, theirs.theta, atol=0, rtol=0)
+        torch.testing.assert_close(mine.covariance, theirs.covariance, atol=0, rtol=0)
+
+
+def test_estimates_do_not_change_afterwards() -> None:
+    ukf = free_ukf()
+    run = free_run(10)
+    first = [ukf.update(next(run)) for _ in range(3)][-1]
+    theta, covariance = first.theta.clone(), first.covariance.clone()
+    for measurement in run:
+        ukf.update(measurement)
+    ukf.correct(torch.ones(1, 2))
+    torch.testing.assert_close(first.theta, theta, atol=0, rtol=0)
+    torch.testing.assert_close(first.covariance, covariance, atol=0, rtol=0)
+
+
+def test_prior_of_a_box() -> None:
+    lower, upper = torch.tensor([[-1.0, 2.0]]), torch.tensor([[3.0, 2.6]])
+    ukf = ParameterUkf.from_prior(TASK, BARRIERS, lower, upper)
+    first = ukf.update(next(free_run(1)))
+    torch.testing.assert_close(first.theta, torch.tensor([[1.0, 2.3]]).double(), atol=1e-6, rtol=0)
+    expected = torch.diag(torch.tensor([16.0, 0.36]) / 12).double()
+    torch.testing.assert_close(first.covariance[0], expected, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("spread", [2.0, torch.tensor([2.0, 2.0]), torch.full((1, 2), 2.0)])
+def test_spread_of_any_shape(spread: float | Tensor) -> None:
+    first = ParameterUkf(TASK, BARRIERS, torch.zeros(1, 2), spread).update(next(free_run(1)))
+    torch.testing.assert_close(first.covariance[0], 4 * torch.eye(2).double())
+
+
+def test_correct_moves_the_position_along() -> None:
+    """The corrected state is the one with this theta that is nearest in the metric of the whole covariance."""
+    ukf = free_ukf()
+    run = free_run(20)
+    for _ in range(4):
+        ukf.update(next(run))
+    kalman = ukf.filters[0]
+    assert kalman is not None
+    before, P = kalman.x.copy(), kalman.P.copy()
+    theta = torch.tensor([[1.0, 1.0]]).double()
+    ukf.correct(theta)
+    np.testing.assert_allclose(kalman.x[2:], theta[0], atol=0)
+    np.testing.assert_allclose(kalman.P, P, atol=0)
+    # Optimal: the information matrix times the change pushes on theta alone.
+    push = np.linalg.solve(P, kalman.x - before)
+    np.testing.assert_allclose(push[:2], 0.0, atol=1e-9 * np.abs(push[2:]).max())
+
+
+def test_correct_before_anything_is_seen() -> None:
+    ukf = free_ukf()
+    theta = torch.tensor([[1.0, 1.5]]).double()
+    ukf.correct(theta)
+    torch.testing.assert_close(ukf.update(next(free_run(1))).theta, theta)
+
+
+def test_time_has_to_increase() -> None:
+    ukf = free_ukf()
+    first, second = free_run(2)
+    ukf.update(second)
+    for late in (first, second, replace(second, t=math.nan), replace(second, t=math.inf)):
+        with pytest.raises(InputError, match=r"measurement\.t"):
+            ukf.update(late)
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"mean": torch.zeros(1, 3)}, "mean"),
+        ({"mean": torch.full((1, 2), math.nan)}, "mean"),
+        ({"spread": 0.0}, "spread"),
+        ({"spread": torch.ones(5, 2)}, "spread"),
+        ({"position_noise": 0.0}, "noises"),
+        ({"process_noise": -1.0}, "noises"),
+        ({"motion_noise": math.nan}, "noises"),
+        ({"active_tolerance": 0.0}, "noises"),
+    ],
+)
+def test_wrong_settings_are_named(change: dict[str, object], name: str) -> None:
+    settings: dict = {"mean": torch.zeros(1, 2), "spread": 1.0} | change
+    with pytest.raises(InputError, match=name):
+        ParameterUkf(TASK, BARRIERS, **settings)
+
+
+def test_wrong_measurements_are_named(team: Trajectory) -> None:
+    ukf = free_ukf()
+    with pytest.raises(InputError, match="measurement"):
+        ukf.update(replace(next(free_run(1)), u=None))
+    with pytest.raises(InputError, match="measurement"):
+        ukf.update(team.measurement(0))
+    for theta in (torch.zeros(2, 2), torch.full((1, 2), math.nan)):
+        with pytest.raises(InputError, match="theta"):
+            ukf.correct(theta)
+
+
+@pytest.mark.parametrize("qp_inside", [False, True])
+def test_single_precision_and_no_bodies(qp_inside: bool) -> None:
+    ukf, goal, x = free_ukf(qp_inside=qp_inside), torch.tensor([[2.0, -1.0]]), torch.zeros(1, 2)
+    for k in range(20):
+        nobody = torch.zeros(1, 0, 2)
+        estimate = ukf.update(Measurement(0.05 * k, x, goal - x, nobody, nobody.bool().all(-1)))
+        x = x + 0.05 * (goal - x)
+    torch.testing.assert_close(estimate.theta, goal.double(), atol=1e-3, rtol=0)
+
+
+def test_no_gradient_leaks(two_pairs: Trajectory) -> None:
+    measurement = two_pairs.measurement(0)
+    ukf = ParameterUkf(VelocityTask(), BARRIERS, torch.zeros(1, 2, requires_grad=True), 1.0)
+    estimate = ukf.update(replace(measurement, x=measurement.x.clone().requires_grad_()))
+    assert not estimate.theta.requires_grad
