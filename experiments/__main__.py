@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 USAGE_ERROR, INTERRUPTED = 2, 130
 
+TABLE_WIDTH = 100
+"""Columns that the tables need; a narrower terminal wraps them."""
+
 
 class _Parser(argparse.ArgumentParser):
     """Mistakes are answered by one line."""
@@ -77,7 +80,8 @@ def _run(path: Path, out: Path, overrides: Sequence[str]) -> None:
 
     summary = run(config, out, observing)
     _draw(out)
-    (print_table if config.kind == "cases" else print_verdict)(summary, Console())
+    console = Console(width=max(Console().width, TABLE_WIDTH))
+    (print_table if config.kind == "cases" else print_verdict)(summary, console)
 
 
 def _draw(folder: Path) -> None:

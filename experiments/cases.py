@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from experiments.config import CaseConfig, CasesConfig
@@ -59,8 +59,8 @@ def _measurements(config: CasesConfig, controller: CbfQpController, goals: Tenso
         x = x + config.dt * u
 
 
-def _places(case: CaseConfig, config: CasesConfig) -> tuple[Float[Tensor, "m 2"], Float[Tensor, "m"], Bool[Tensor, "m"]]:
-    """Where the bodies are as seen from the robot at the start, their radii, and which slots are taken."""
+def _places(case: CaseConfig, config: CasesConfig) -> tuple[Tensor, Tensor, Tensor]:
+    """Offsets (m, 2) of the bodies from the robot at the start, their radii (m,), and which slots are taken (m,)."""
     slots, taken = _slots(config), len(case.bodies)
     gamma, margin = config.avoidance.class_k.gain, config.avoidance.margin
     assert margin is not None

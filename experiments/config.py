@@ -6,14 +6,26 @@ Each file is complete: nothing is inherited, and what is left out has the defaul
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
-from pydantic_core import PydanticCustomError
 
-from torchfsid.config import (AvoidanceConfig, BarrierConfig, BodyName, GoalConfig, NoiseConfig, NonNegative, Number, PlanarVector, Positive, PriorConfig, UkfConfig)
-from torchfsid.documents import (Strict, apply_overrides, read_yaml, validate)
+from torchfsid.config import (
+    AvoidanceConfig,
+    BarrierConfig,
+    BodyName,
+    GoalConfig,
+    NoiseConfig,
+    NonNegative,
+    Number,
+    PlanarVector,
+    Positive,
+    PriorConfig,
+    UkfConfig,
+)
+from torchfsid.documents import Strict, apply_overrides, read_yaml, validate, wrong
 from torchfsid.errors import ConfigError
 
 MAX_STEPS = 1_000_000
@@ -55,7 +67,7 @@ class ExpectedConfig(Strict):
     @model_validator(mode="after")
     def _one_of_both(self) -> ExpectedConfig:
         if (self.active is None) == (self.count is None):
-            raise _wrong("expected either active (names) or count (a number)")
+            raise wrong("expected either active (names) or count (a number)")
         return self
 
 
@@ -89,15 +101,15 @@ class ExperimentConfig(Strict):
     @model_validator(mode="after")
     def _fits_the_task(self) -> ExperimentConfig:
         if len(self.prior.lower) != self.task.parameters:
-            raise _wrong(f"a goal has {self.task.parameters} entries, lower has {len(self.prior.lower)}", "prior")
+            raise wrong(f"a goal has {self.task.parameters} entries, lower has {len(self.prior.lower)}", "prior")
         if not 1 <= self.duration / self.dt <= MAX_STEPS:
-            raise _wrong(f"expected 1 to {MAX_STEPS} steps of dt = {self.dt} s, got {self.duration} s", "duration")
+            raise wrong(f"expected 1 to {MAX_STEPS} steps of dt = {self.dt} s, got {self.duration} s", "duration")
         return self
 
     def _require_in_prior(self, goal: Sequence[float], path: str) -> None:
         bounds = zip(self.prior.lower, goal, self.prior.upper, strict=True)
         if not all(low <= x <= high for low, x, high in bounds):
-            raise _wrong(f"the prior does not hold it: {list(goal)}", path)
+            raise wrong(f"the prior does not hold it: {list(goal)}", path)
 
 
 class SceneConfig(ExperimentConfig):
@@ -125,26 +137,26 @@ class SceneConfig(ExperimentConfig):
     def _is_a_scene(self) -> SceneConfig:
         names = self.bodies
         if repeated := [name for i, name in enumerate(names) if name in names[:i]]:
-            raise _wrong(f"two bodies are called {repeated[0]!r}", "robots, obstacles")
+            raise wrong(f"two bodies are called {repeated[0]!r}", "robots, obstacles")
         for i, robot in enumerate(self.robots):
             self._require_in_prior(robot.goal, f"robots[{i}].goal")
         for i, barrier in enumerate(self.barriers):
             if isinstance(barrier, AvoidanceConfig) and barrier.margin is not None:
-                raise _wrong("bodies of a scene have no radius: give safety_distance", f"barriers[{i}].margin")
+                raise wrong("bodies of a scene have no radius: give safety_distance", f"barriers[{i}].margin")
         _require_increasing(self.snapshots, "snapshots")
         if self.snapshots[-1] > self.duration:
-            raise _wrong(f"must not be after the end, {self.duration} s, got {self.snapshots[-1]}", "snapshots")
+            raise wrong(f"must not be after the end, {self.duration} s, got {self.snapshots[-1]}", "snapshots")
         self._check_expected()
         return self
 
     def _check_expected(self) -> None:
         if self.expected and len(self.robots) > 1:
-            raise _wrong("only a scene of one robot has an expected timeline", "expected")
+            raise wrong("only a scene of one robot has an expected timeline", "expected")
         _require_increasing([interval.until for interval in self.expected], "expected")
         obstacles = [obstacle.name for obstacle in self.obstacles]
         for i, interval in enumerate(self.expected):
             if unknown := [name for name in interval.active or () if name not in obstacles]:
-                raise _wrong(f"no obstacle is called {unknown[0]!r}", f"expected[{i}].active")
+                raise wrong(f"no obstacle is called {unknown[0]!r}", f"expected[{i}].active")
 
 
 class CaseBodyConfig(Strict):
@@ -195,12 +207,12 @@ class CasesConfig(ExperimentConfig):
         self._require_in_prior(self.goal, "goal")
         names = [case.name for case in self.cases]
         if repeated := [name for i, name in enumerate(names) if name in names[:i]]:
-            raise _wrong(f"two cases are called {repeated[0]!r}", "cases")
+            raise wrong(f"two cases are called {repeated[0]!r}", "cases")
         barrier = self.barriers[0]
         if len(self.barriers) > 1 or not isinstance(barrier, AvoidanceConfig) or barrier.margin is None:
-            raise _wrong("expected one avoidance barrier with a margin", "barriers")
+            raise wrong("expected one avoidance barrier with a margin", "barriers")
         if (barrier.distance, barrier.class_k.power, barrier.neighbour_velocity) != ("squared", 1, "none"):
-            raise _wrong("expected the paper's row: squared, power 1, neighbour_velocity none", "barriers[0]")
+            raise wrong("expected the paper's row: squared, power 1, neighbour_velocity none", "barriers[0]")
         return self
 
 
@@ -217,11 +229,6 @@ def load_experiment(path: str | Path, overrides: Iterable[str] = ()) -> SceneCon
 
 
 def _require_increasing(times: Sequence[float], path: str) -> None:
-    for before, after in zip(times, times[1:], strict=False):
+    for before, after in pairwise(times):
         if not before < after:
-            raise _wrong(f"times must increase, got {after} after {before}", path)
-
-
-def _wrong(message: str, path: str | None = None) -> PydanticCustomError:
-    """An error whose message is complete, about the key at `path`, as `torchfsid.config` words them."""
-    return PydanticCustomError("complete", "{message}", {"message": message, "key": path})
+            raise wrong(f"times must increase, got {after} after {before}", path)

@@ -1,5 +1,5 @@
-"""How large and how wrong everything is. Lengths are compared with lengths: of a region its diameter and the square root
-of its area, of an estimate its distance to the goal.
+"""How large and how wrong everything is. Lengths are compared with lengths: of a region its diameter and the square
+root of its area, of an estimate its distance to the goal.
 """
 
 from __future__ import annotations

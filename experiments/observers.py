@@ -9,14 +9,13 @@ import torch
 
 from experiments.config import ExperimentConfig
 from experiments.recording import Recording
+from experiments.saved import SETS
 from experiments.tally import SetTally, Tally
 from torchfsid.feasible_set import FeasibleSet
 from torchfsid.hybrid import HybridEstimate, HybridObserver
 from torchfsid.measurement import Measurement
-from torchfsid.observer import SetEstimate, SetKind, SetMembershipObserver
+from torchfsid.observer import SetEstimate, SetMembershipObserver
 from torchfsid.ukf import ParameterUkf
-
-SETS: tuple[SetKind, ...] = ("critical_region", "inverse_optimal")
 
 
 @dataclass

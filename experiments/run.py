@@ -27,7 +27,7 @@ from experiments.saved import Results
 from experiments.summary import summarise_scene
 from experiments.table import measure_cases
 from torchfsid.barriers import stack_barriers
-from torchfsid.documents import (dump)
+from torchfsid.documents import dump
 from torchfsid.measurement import Measurement
 from torchfsid.observer import SetEstimate
 from torchfsid.results import ResultsWriter, write_json

@@ -9,13 +9,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from experiments.config import CasesConfig, SceneConfig, load_experiment
 
-SETS = ("critical_region", "inverse_optimal")
+SETS: tuple[Literal["critical_region", "inverse_optimal"], ...] = ("critical_region", "inverse_optimal")
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,12 @@ def summarise_scene(results: Results, observers: Observers, true: Trajectory) ->
         ],
         "time_below": {
             f"{share:.0%}": {
-                name: per_robot([stays_below(results.t, values[:, i], share * prior[name][i]) for i in range(len(active))])
+                name: per_robot(
+                    [
+                        stays_below(results.t, of, share * before)
+                        for of, before in zip(values.T, prior[name], strict=True)
+                    ]
+                )
                 for name, values in measures.items()
             }
             for share in SHARES

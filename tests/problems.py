@@ -12,6 +12,7 @@ from fractions import Fraction
 import daqp
 import numpy as np
 import torch
+from torch import Tensor
 
 from torchfsid.halfspaces import Halfspaces
 
@@ -38,7 +39,7 @@ class Scene:
         return Halfspaces(torch.from_numpy(self.A), torch.from_numpy(self.b))
 
     @property
-    def tensors(self) -> tuple[Halfspaces, torch.Tensor, torch.Tensor, torch.Tensor]:
+    def tensors(self) -> tuple[Halfspaces, Tensor, Tensor, Tensor]:
         """(safe_controls, active, C, d), as `critical_region` takes them."""
         return self.safe_controls, torch.from_numpy(self.active), torch.from_numpy(self.C), torch.from_numpy(self.d)
 
@@ -116,6 +117,22 @@ def rotated(scene: Scene, angle: float) -> Scene:
     """The controls, and with them rows and task, turned; the set of parameters must not notice."""
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     return replace(scene, A=scene.A @ turn.T, C=turn @ scene.C, d=turn @ scene.d, u=turn @ scene.u)
+
+
+def batch(scenes: Sequence[Scene], rows: int | None = None) -> tuple[Halfspaces, Tensor, Tensor, Tensor, Tensor]:
+    """(safe_controls, active, u, C, d) of many scenes, padded to `rows`."""
+    rows = rows or max(len(scene.b) for scene in scenes)
+    A = torch.zeros(len(scenes), rows, 2, dtype=torch.float64)
+    b, active = torch.ones(A.shape[:2], dtype=torch.float64), torch.zeros(A.shape[:2], dtype=torch.bool)
+    for i, scene in enumerate(scenes):
+        m = len(scene.b)
+        A[i, :m], b[i, :m], active[i, :m] = map(torch.from_numpy, (scene.A, scene.b, scene.active))
+    u, C, d = (torch.from_numpy(np.stack([getattr(scene, part) for scene in scenes])) for part in ("u", "C", "d"))
+    return Halfspaces(A, b), active, u, C, d
+
+
+def true_thetas(scenes: Sequence[Scene]) -> Tensor:
+    return torch.from_numpy(np.stack([scene.theta for scene in scenes]))
 
 
 # Solvers ------------------------------------------------------------------------------------------------------------

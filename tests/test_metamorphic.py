@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tests.problems import CASES, Scene, paper_case, random_scene, rotated
 from torch import Tensor
 
+from tests.problems import CASES, Scene, batch, paper_case, random_scene, rotated, true_thetas
 from torchfsid.clipping import clip
 from torchfsid.critical_region import critical_region
 from torchfsid.halfspaces import Halfspaces
@@ -34,7 +34,9 @@ every_set = pytest.mark.parametrize("set_of", SETS.values(), ids=SETS.keys())
 
 def scenes() -> list[Scene]:
     rng = np.random.default_rng(0)
-    return [paper_case(case, rng) for case in CASES for _ in range(3)] + [random_scene(rng, 1 + k % 8) for k in range(40)]
+    return [paper_case(case, rng) for case in CASES for _ in range(3)] + [
+        random_scene(rng, 1 + k % 8) for k in range(40)
+    ]
 
 
 SCENES = scenes()
@@ -44,30 +46,16 @@ def supports(theta: Halfspaces, around: Tensor) -> Tensor:
     """Supports within a box around each scene's theta, less what the theta itself contributes."""
     b = theta.b - (theta.A @ around.unsqueeze(-1)).squeeze(-1)
     half = torch.full((len(b), 2), BOX, dtype=torch.float64)
-    clipped = clip(Polygon.from_box(-half, half), theta.A, b, b.new_zeros(len(b)), torch.zeros(b.shape, dtype=torch.long))
+    clipped = clip(
+        Polygon.from_box(-half, half), theta.A, b, b.new_zeros(len(b)), torch.zeros(b.shape, dtype=torch.long)
+    )
     return clipped.body.support(DIRECTIONS.expand(len(b), -1, -1))
-
-
-def batch(items: list[Scene], rows: int | None = None) -> tuple[Halfspaces, Tensor, Tensor, Tensor, Tensor]:
-    """The scenes as one batch, padded to `rows`."""
-    rows = rows or max(len(scene.b) for scene in items)
-    A, b = torch.zeros(len(items), rows, 2, dtype=torch.float64), torch.ones(len(items), rows, dtype=torch.float64)
-    active = torch.zeros(len(items), rows, dtype=torch.bool)
-    for i, scene in enumerate(items):
-        m = len(scene.b)
-        A[i, :m], b[i, :m], active[i, :m] = map(torch.from_numpy, (scene.A, scene.b, scene.active))
-    u, C, d = (torch.from_numpy(np.stack([getattr(scene, part) for scene in items])) for part in ("u", "C", "d"))
-    return Halfspaces(A, b), active, u, C, d
-
-
-def thetas(items: list[Scene]) -> Tensor:
-    return torch.from_numpy(np.stack([scene.theta for scene in items]))
 
 
 def assert_same_sets(set_of: SetOf, changed: list[Scene]) -> None:
     """The changed scenes give the sets of `SCENES`, each about its own theta."""
-    expected = supports(set_of(*batch(SCENES)), thetas(SCENES))
-    assert torch.allclose(supports(set_of(*batch(changed)), thetas(changed)), expected, rtol=0, atol=1e-9)
+    expected = supports(set_of(*batch(SCENES)), true_thetas(SCENES))
+    assert torch.allclose(supports(set_of(*batch(changed)), true_thetas(changed)), expected, rtol=0, atol=1e-9)
 
 
 # What must not matter (check 4) -------------------------------------------------------------------------------------
@@ -107,9 +95,7 @@ def parameters_translated(scene: Scene, rng: np.random.Generator) -> Scene:
 
 
 @every_set
-@pytest.mark.parametrize(
-    "change", [reordered, scaled, duplicated, turned, controls_translated, parameters_translated]
-)
+@pytest.mark.parametrize("change", [reordered, scaled, duplicated, turned, controls_translated, parameters_translated])
 def test_the_set_does_not_change(set_of: SetOf, change: Callable[[Scene, np.random.Generator], Scene]):
     rng = np.random.default_rng(1)
     assert_same_sets(set_of, [change(scene, rng) for scene in SCENES])
@@ -129,8 +115,9 @@ def test_the_comparison_sees_a_change(set_of: SetOf):
 @every_set
 def test_a_batch_is_the_loop(set_of: SetOf):
     """Ragged scenes padded to 8 rows and more, against each alone and unpadded."""
-    together = supports(set_of(*batch(SCENES, rows=11)), thetas(SCENES))
-    alone = torch.cat([supports(set_of(*batch([scene])), thetas([scene])) for scene in SCENES])
+    some = SCENES[::2]
+    together = supports(set_of(*batch(some, rows=11)), true_thetas(some))
+    alone = torch.cat([supports(set_of(*batch([scene])), true_thetas([scene])) for scene in some])
     assert torch.allclose(together, alone, rtol=0, atol=1e-9)
 
 
@@ -154,7 +141,9 @@ def test_no_rows_at_all_are_the_same_as_padding(set_of: SetOf):
     safe = Halfspaces(torch.zeros(1, 0, 2), torch.zeros(1, 0))
     _, active, u, C, d = batch([scene], rows=1)
     assert torch.allclose(
-        supports(set_of(safe, active[:, :0], u, C, d), thetas([scene])), supports(nothing, thetas([scene])), atol=1e-12
+        supports(set_of(safe, active[:, :0], u, C, d), true_thetas([scene])),
+        supports(nothing, true_thetas([scene])),
+        atol=1e-12,
     )
 
 
@@ -212,7 +201,9 @@ def test_polygons_turn_and_move_with_their_rows():
     half = torch.full((50, 2), 4 * BOX, dtype=torch.float64)
     box, directions = Polygon.from_box(-half, half), DIRECTIONS.expand(50, -1, -1)
     before, after = clipped(A, b, box), clipped(A @ turn.T, b + A @ turn.T @ shift, box)
-    assert torch.allclose(after.support(directions @ turn.T), before.support(directions) + directions @ turn.T @ shift, atol=1e-11)
+    assert torch.allclose(
+        after.support(directions @ turn.T), before.support(directions) + directions @ turn.T @ shift, atol=1e-11
+    )
     assert torch.allclose(after.volume(), before.volume(), rtol=1e-11)
     assert torch.allclose(after.centroid(), before.centroid() @ turn.T + shift, atol=1e-11)
     assert torch.allclose(after.chebyshev()[1], before.chebyshev()[1], atol=1e-11)

@@ -7,9 +7,9 @@ supports of both sets in random directions, by linear programmes over (theta, et
 import numpy as np
 import pytest
 import torch
+
 from tests.paper_expressions import BOX, Lifted, omega
 from tests.problems import CASES, Scene, paper_case
-
 from torchfsid.critical_region import critical_region
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.kkt import CASES as LETTERS

@@ -15,6 +15,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
+from torch import Tensor
+
 from tests.problems import (
     Point,
     exact,
@@ -25,8 +27,6 @@ from tests.problems import (
     exactly_feasible,
     solve_qp,
 )
-from torch import Tensor
-
 from torchfsid.clipping import Clipped, Outcome, clip, merge
 from torchfsid.polygon import ROUND_OFF, Polygon, round_off
 
@@ -69,7 +69,7 @@ def rows_around(
     angles, distance = rng.uniform(0, 2 * np.pi, (count, rows)), rng.uniform(0.2, 3.0, (count, rows))
     if width < 1:
         heading = np.arange(count)[:, None] + rng.normal(size=(count, 2)) * (0.3 * width if needle else 0.0)
-        angles[:, :2], distance[:, :2] = heading + [0, np.pi], rng.uniform(0.5, 1.0, (count, 2)) * width
+        angles[:, :2], distance[:, :2] = heading + np.array([0, np.pi]), rng.uniform(0.5, 1.0, (count, 2)) * width
     A = unit(angles) * 10 ** rng.uniform(-2, 2, (count, rows, 1))
     return A, (A * truth[:, None]).sum(-1) + distance * np.linalg.norm(A, axis=-1)
 
@@ -149,7 +149,7 @@ def test_thin_sets_keep_the_truth_and_their_area(width: float, needle: bool):
 
 
 def test_rows_that_touch_within_round_off_change_nothing():
-    """Rows that cut a corner off by about the tolerance itself, in numbers for which BLAS rounds batches differently."""
+    """Rows that cut a corner off by about the tolerance itself, so many that BLAS rounds batches differently."""
     rng = np.random.default_rng(0)
     before = boxes(128)
     normals = tensor(unit(rng.uniform(0, 2 * np.pi, (128, 100))))
@@ -200,7 +200,7 @@ def test_chebyshev_disc_is_that_of_a_linear_programme():
 
 @pytest.mark.parametrize("width", [1.0, 1e-3, 1e-6, 1e-9])
 def test_chebyshev_radius_of_thin_sets_is_exact(width: float):
-    """In rationals, by duality: the least lambda.b over triples of rows with lambda >= 0, sum lambda (a, |a|) = (0, 1)."""
+    """In rationals, by duality: the least lambda.b over triples with lambda >= 0, sum lambda (a, |a|) = (0, 1)."""
     rng = np.random.default_rng(12)
     polygon = cut(boxes(20), *rows_around(rng, rng.uniform(-5, 5, (20, 2)), 6, width, needle=True)).body
     radius = polygon.chebyshev()[1]
@@ -224,7 +224,7 @@ def inscribed_bound(triple: tuple) -> Fraction | None:
 
 @pytest.mark.parametrize("euclidean", [True, False], ids=["euclidean", "metric"])
 def test_nearest_point_is_that_of_a_quadratic_programme(euclidean: bool):
-    polygon, rings = random_polygons(13, count=100)
+    polygon = random_polygons(13, count=100)[0]
     rng = np.random.default_rng(13)
     points = polygon.centroid().numpy() + rng.normal(size=(100, 2)) * rng.choice([0.1, 3.0], (100, 1))
     roots = np.stack([np.eye(2)] * 100) if euclidean else np.eye(2) + 0.7 * rng.normal(size=(100, 2, 2))
@@ -258,13 +258,13 @@ def assert_outer(outer: Polygon, inner: Polygon) -> None:
 
 @pytest.mark.parametrize(("most", "growth"), [(32, 0.004), (24, 0.007), (8, 0.08), (4, 0.6)])
 def test_merge_is_outer_and_small(most: int, growth: float):
-    """100 random tangents of a disc; `growth` is measured: the regular polygon of 24 has 0.6 % more area than the disc."""
+    """100 random tangents of a disc; `growth` is measured: a regular polygon of 24 sides has 0.6 % more than a disc."""
     polygon = cut(boxes(10), unit(np.random.default_rng(5).uniform(0, 2 * np.pi, (10, 100))), np.ones((10, 100))).body
     merged = merge(polygon, most)
     assert (merged.count <= most).all()
     assert_outer(merged, polygon)
     grown = merged.volume() / polygon.volume() - 1
-    assert 0 <= grown.min()
+    assert grown.min() >= 0
     assert grown.max() < growth
 
 

@@ -6,8 +6,8 @@ Thetas so near a boundary that round-off decides are left out, by an explicit ma
 import numpy as np
 import pytest
 import torch
-from tests.problems import ACTIVE, CASES, Scene, paper_case, random_scene, slack, solve_qp
 
+from tests.problems import ACTIVE, CASES, Scene, paper_case, random_scene, slack, solve_qp
 from torchfsid.critical_region import critical_region
 
 MARGIN = 1e-7
@@ -68,3 +68,18 @@ def test_in_each_of_the_papers_cases(case: str):
         assert np.allclose(solve_qp(scene.A, scene.b, scene.nominal(scene.theta)), scene.u, atol=1e-9)
     # Three rows whose cone is the plane leave a single safe control: every theta has this active set.
     check(scenes, rng, per_scene=50, everywhere=case == "E three whole plane")
+
+
+@pytest.mark.parametrize("turn", [0.0, np.pi], ids=["same side", "opposite"])
+@pytest.mark.parametrize("angle", 10.0 ** -np.arange(2, 13))
+def test_truth_is_inside_for_rows_at_any_angle(angle: float, turn: float):
+    """Two active rows, down to angles where their intersection is lost in round-off and they had better be one."""
+    rng = np.random.default_rng(5)
+    for _ in range(100):
+        first = rng.uniform(0, 2 * np.pi)
+        directions = np.array([first, first + turn + angle, rng.uniform(0, 2 * np.pi)])
+        A = rng.uniform(0.5, 3, (3, 1)) * np.stack([np.cos(directions), np.sin(directions)], axis=-1)
+        u, multipliers = rng.normal(size=2), rng.uniform(0.1, 1, 2)
+        theta, active = u + multipliers @ A[:2], np.array([True, True, False])
+        scene = Scene(A, A @ u + np.array([0, 0, 1.0]), np.eye(2), np.zeros(2), theta, u, active)
+        assert bool(critical_region(*scene.tensors).contains(torch.from_numpy(theta), tolerance=1e-9))

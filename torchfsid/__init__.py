@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from torchfsid.tasks import GoalTask as GoalTask
     from torchfsid.tasks import OrbitTask as OrbitTask
     from torchfsid.tasks import PatrolTask as PatrolTask
+    from torchfsid.tasks import Saturation as Saturation
     from torchfsid.tasks import UnknownGainGoalTask as UnknownGainGoalTask
     from torchfsid.tasks import VelocityTask as VelocityTask
     from torchfsid.ukf import ParameterUkf as ParameterUkf
@@ -57,6 +58,7 @@ _HOME = {
         "GoalTask",
         "OrbitTask",
         "PatrolTask",
+        "Saturation",
         "UnknownGainGoalTask",
         "VelocityTask",
     ],

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -24,7 +24,14 @@ from torch import Tensor
 
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.measurement import Measurement
+from torchfsid.measurement import ErrorBounds, Measurement
+
+
+class RowErrors(NamedTuple):
+    """How far the rows of a barrier may be off: their direction [rad], and what they say of a control's slack [m/s]."""
+
+    angle: Float[Tensor, "*batch m"]
+    slack: Float[Tensor, "*batch m"]
 
 
 @runtime_checkable
@@ -36,6 +43,10 @@ class Barrier(Protocol):
     def soft(self) -> bool: ...
 
     def __call__(self, measurement: Measurement) -> Halfspaces: ...
+
+    def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
+        """How far the rows may be off if the measurement is, by at most the bounds."""
+        ...
 
     def labels(self, bodies: Sequence[str]) -> list[str]:
         """A name for each row, given the names of the bodies."""
@@ -100,8 +111,41 @@ class CollisionAvoidance:
             b = b - (gradient * self._neighbours(measurement)).sum(-1)
         return Halfspaces(-gradient, b).where(present)
 
+    def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
+        """With r = |dx| known up to e: the direction up to asin(e/r), the boundary's distance phi(r) =
+        alpha(h)/|dh/dx|, which grows with r, by at most phi(r) - phi(r - e), and u across the turned row by 2
+        sin(angle/2) |u
+        - u_j|.
+
+        Raises:
+            InputError: class_k.power < 1/2 with squared distances: phi would not be monotone.
+        """
+        if self.distance == "squared" and self.class_k.power < 0.5:
+            raise InputError("class_k.power", "at least 1/2 where positions have errors", self.class_k.power)
+        present = measurement.present
+        away = torch.where(present.unsqueeze(-1), measurement.x.unsqueeze(-2) - measurement.bodies, 1.0)
+        r = away.square().sum(-1).sqrt()
+        e = bounds.position.unsqueeze(-1) + bounds.body_position
+        angle = torch.where(e < r, (e / r).clamp(max=1.0).arcsin(), math.pi)
+        motion = torch.zeros_like(away) if measurement.u is None else measurement.u.unsqueeze(-2)
+        velocity_error = torch.zeros_like(r)
+        if self.neighbour_velocity != "none":
+            motion = motion - self._neighbours(measurement)
+            velocity_error = bounds.body_velocity
+        turned = 2 * (angle / 2).sin() * motion.norm(dim=-1)
+        moved = self._boundary(r, measurement) - self._boundary((r - e).clamp(min=1e-9), measurement)
+        slack = torch.where(e < r, moved, torch.inf) + turned + velocity_error
+        return RowErrors(torch.where(present, angle, 0.0), torch.where(present, slack, 0.0))
+
     def labels(self, bodies: Sequence[str]) -> list[str]:
         return [f"avoid {body}" for body in bodies]
+
+    def _boundary(self, r: Tensor, measurement: Measurement) -> Tensor:
+        """phi(r): how fast the robot may approach a standing body at distance r [m/s]."""
+        Ds = self._safety_distance(measurement)
+        if self.distance == "squared":
+            return self.class_k(r**2 - Ds**2) / (2 * r)
+        return self.class_k(r - Ds)
 
     def _safety_distance(self, measurement: Measurement) -> Tensor | float:
         if self.margin is None:
@@ -132,9 +176,11 @@ class SpeedBox:
 
     def __call__(self, measurement: Measurement) -> Halfspaces:
         identity = torch.eye(len(self.limit), dtype=torch.float64)
-        return _constant(
-            torch.cat([identity, -identity]), torch.tensor(self.limit * 2, dtype=torch.float64), measurement
-        )
+        limits = torch.tensor(self.limit * 2, dtype=torch.float64)
+        return _constant(torch.cat([identity, -identity]), limits, measurement)
+
+    def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
+        return _exact(2 * len(self.limit), bounds)
 
     def labels(self, bodies: Sequence[str]) -> list[str]:
         return [f"speed {sign}{axis}" for sign in "+-" for axis in "xyz"[: len(self.limit)]]
@@ -158,6 +204,9 @@ class SpeedPolygon:
         apothem = self.limit * math.cos(math.pi / self.sides)
         return _constant(normals, torch.full((self.sides,), apothem, dtype=torch.float64), measurement)
 
+    def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
+        return _exact(self.sides, bounds)
+
     def labels(self, bodies: Sequence[str]) -> list[str]:
         return [f"speed side {side}" for side in range(self.sides)]
 
@@ -177,18 +226,30 @@ class Arena:
             raise InputError("arena", "lower < upper on every axis [m]", (self.lower, self.upper))
 
     def __call__(self, measurement: Measurement) -> Halfspaces:
-        x = measurement.x
+        h = self._distances(measurement.x)
         identity = torch.eye(len(self.lower), dtype=torch.float64)
-        to_upper = torch.tensor(self.upper, dtype=torch.float64) - self.margin - x
-        to_lower = x - torch.tensor(self.lower, dtype=torch.float64) - self.margin
-        h = torch.cat([to_upper, to_lower], dim=-1)
-        return Halfspaces(torch.cat([identity, -identity]).expand(*h.shape, x.shape[-1]), self.class_k(h))
+        return Halfspaces(torch.cat([identity, -identity]).expand(*h.shape, len(self.lower)), self.class_k(h))
+
+    def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
+        h = self._distances(measurement.x)
+        return RowErrors(torch.zeros_like(h), self.class_k(h) - self.class_k(h - bounds.position.unsqueeze(-1)))
 
     def labels(self, bodies: Sequence[str]) -> list[str]:
         return [f"wall {sign}{axis}" for sign in "+-" for axis in "xyz"[: len(self.lower)]]
+
+    def _distances(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch 2*n"]:
+        to_upper = torch.tensor(self.upper, dtype=torch.float64) - self.margin - x
+        to_lower = x - torch.tensor(self.lower, dtype=torch.float64) - self.margin
+        return torch.cat([to_upper, to_lower], dim=-1)
 
 
 def _constant(A: Tensor, b: Tensor, measurement: Measurement) -> Halfspaces:
     """The same rows for every robot of the batch."""
     batch = measurement.x.shape[:-1]
     return Halfspaces(A.expand(*batch, *A.shape), b.expand(*batch, *b.shape))
+
+
+def _exact(rows: int, bounds: ErrorBounds) -> RowErrors:
+    """Rows that no position moves."""
+    nothing = bounds.position.unsqueeze(-1).expand(*bounds.position.shape, rows) * 0.0
+    return RowErrors(nothing, nothing)

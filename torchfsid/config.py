@@ -8,6 +8,7 @@ Nothing here imports torch before something is built, so that a wrong file is re
 
 from __future__ import annotations
 
+import math
 import reprlib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -49,27 +50,64 @@ Vector = Annotated[tuple[Number, ...], Field(min_length=1)]
 PlanarVector = Annotated[tuple[Number, ...], Field(min_length=2, max_length=2)]
 
 
+class NormSaturationConfig(Strict):
+    """|uhat| <= limit [m/s]."""
+
+    kind: Literal["norm"] = "norm"
+    limit: Positive
+
+
+class BoxSaturationConfig(Strict):
+    """|uhat_i| <= limit_i [m/s]."""
+
+    kind: Literal["box"] = "box"
+    limit: PlanarVector
+
+    @model_validator(mode="after")
+    def _is_positive(self) -> BoxSaturationConfig:
+        if min(self.limit) <= 0:
+            raise wrong(f"limits must be greater than 0, got {min(self.limit)}", "limit")
+        return self
+
+
+SaturationConfig = Annotated[NormSaturationConfig | BoxSaturationConfig, Field(discriminator="kind")]
+
+
 class _Task(Strict):
     @property
     def parameters(self) -> int:
         """p, the number of entries of theta."""
         return 2
 
-    def build(self, bodies: Sequence[str]) -> Task:
-        """The task, for a team of these bodies; `ConfigError` if it needs one that is not there."""
-        raise NotImplementedError
-
 
 class GoalConfig(_Task):
-    """`GoalTask`: go to a goal with a known gain [1/s]."""
+    """`GoalTask`: go to a goal with a known gain [1/s]; clipped; not at all within `dead_zone` of it [m]."""
 
     kind: Literal["goal"] = "goal"
     gain: Positive
+    saturation: SaturationConfig | None = None
+    dead_zone: NonNegative = 0.0
+
+    @model_validator(mode="after")
+    def _moves_at_all(self) -> GoalConfig:
+        if min(self._limits) <= self.gain * self.dead_zone:
+            raise wrong(f"at its edge the speed is {self.gain * self.dead_zone}, not below the limit", "dead_zone")
+        return self
+
+    @property
+    def _limits(self) -> tuple[float, float]:
+        if self.saturation is None:
+            return math.inf, math.inf
+        limit = self.saturation.limit
+        return (limit[0], limit[1]) if isinstance(limit, tuple) else (limit, limit)
 
     def build(self, bodies: Sequence[str]) -> Task:
-        from torchfsid.tasks import GoalTask
+        from torchfsid.tasks import GoalTask, Saturation
 
-        return GoalTask(self.gain)
+        if self.saturation is None and self.dead_zone == 0:
+            return GoalTask(self.gain)
+        shape = "norm" if self.saturation is None else self.saturation.kind
+        return GoalTask(self.gain, saturation=Saturation(shape, self._limits, self.gain * self.dead_zone))
 
 
 class UnknownGainGoalConfig(_Task):
@@ -248,15 +286,17 @@ class PriorConfig(Strict):
 
 
 class NoiseConfig(Strict):
-    """`NoiseBound`: bounds on the error of the measured control [m/s]; `slack` defaults to `velocity`."""
+    """`NoiseBound`: bounds on the errors of controls and slacks [m/s], positions [m], other bodies' velocities [m/s]."""
 
     velocity: NonNegative
     slack: NonNegative | None = None
+    position: NonNegative = 0.0
+    neighbour_velocity: NonNegative = 0.0
 
     def build(self) -> NoiseBound:
         from torchfsid.inverse_optimal import NoiseBound
 
-        return NoiseBound(self.velocity, self.slack)
+        return NoiseBound(self.velocity, self.slack, self.position, self.neighbour_velocity)
 
 
 class UkfConfig(Strict):
@@ -282,9 +322,10 @@ class ObserveConfig(Strict):
 
     Attributes:
         set: the set that is intersected over time.
-        active_tolerance: distance [m/s] to its boundary below which a row counts as active (G., Eqs. (12), (18)).
+        active_tolerance: distance [m/s] to its boundary below which a row counts as active (G., Eqs. (11), (12), (17)).
         velocity: take velocities from the log, or from differences of its positions.
         obstacles: bodies of the log that are avoided but not inferred.
+        on_inconsistent: what an empty intersection does to a set: `hold` it, `reset` it to the prior, or `raise`.
     """
 
     task: TaskConfig
@@ -295,6 +336,7 @@ class ObserveConfig(Strict):
     active_tolerance: Positive = 1e-3
     velocity: Literal["logged", "differentiated"] = "logged"
     obstacles: tuple[BodyName, ...] = ()
+    on_inconsistent: Literal["hold", "reset", "raise"] = "hold"
     ukf: UkfConfig = UkfConfig()
 
     @model_validator(mode="after")
@@ -302,6 +344,8 @@ class ObserveConfig(Strict):
         expected, got = self.task.parameters, len(self.prior.lower)
         if got != expected:
             raise wrong(f"task '{self.task.kind}' has {expected} parameters, lower and upper have {got}", "prior")
+        if self.set == "critical_region" and self.task.kind == "goal" and (self.task.saturation or self.task.dead_zone):
+            raise wrong("critical_region knows no saturation or dead zone, take inverse_optimal", "set")
         return self
 
     @property

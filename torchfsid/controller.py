@@ -158,6 +158,7 @@ class CbfQpController:
             raise InputError("theta", "finite parameters", theta.detach())
         try:
             uhat = (C.to(torch.float64) @ theta.to(torch.float64).unsqueeze(-1)).squeeze(-1) + d
+            uhat = uhat if self.task.saturation is None else self.task.saturation(uhat)
         except RuntimeError as error:
             raise InputError("theta", f"a batch that fits {tuple(d.shape[:-1])}", tuple(theta.shape)) from error
         if measurement.body_velocities is None and any(map(_counts_current_velocities, self.barriers)):

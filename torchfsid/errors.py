@@ -25,5 +25,9 @@ class LogError(FsidError):
     """A log cannot be read as one: the file, the line, what is wrong there."""
 
 
+class InconsistentError(FsidError):
+    """No parameter explains the measurements, and the observer was told to raise then."""
+
+
 class SolverError(FsidError):
     """A third-party solver failed; the original exception is the cause."""

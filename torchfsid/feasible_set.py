@@ -11,7 +11,7 @@ the order of the half-spaces does not matter; it takes the memory of its facets,
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -52,7 +52,7 @@ class FeasibleSet:
     """A batch of bounded convex sets of parameters. Build it with `from_box`, shrink it with `intersect`.
 
     Attributes:
-        body: the sets, batch flattened.
+        body: the sets, batch flattened: a `Polygon` in the plane, a `Polytope` elsewhere.
         batch_shape: the batch.
         outcome: an `Outcome` per item; an EMPTY item contains nothing and stays empty, whatever its body.
         contradiction: for EMPTY items the rows that no parameter satisfies together.
@@ -60,7 +60,7 @@ class FeasibleSet:
         max_facets: facets kept.
     """
 
-    body: Polygon | Polytope
+    body: Any
     batch_shape: torch.Size
     outcome: Int[Tensor, "*batch"]
     contradiction: Facets
@@ -125,7 +125,7 @@ class FeasibleSet:
             raise InputError("halfspaces", "finite rows", "NaN or infinity")
         source = torch.arange(m, device=self.outcome.device) if halfspaces.source is None else halfspaces.source
         halfspaces = halfspaces.where(~self.is_empty.unsqueeze(-1))
-        cut, joined = (clip, merge) if isinstance(self.body, Polygon) else (clip_polytope, merge_polytope)
+        cut, joined = (clip, merge) if p == 2 else (clip_polytope, merge_polytope)
         stamp = torch.as_tensor(time, dtype=torch.float64, device=self.outcome.device).expand(self.batch_shape)
         clipped = cut(
             self.body,
@@ -134,7 +134,8 @@ class FeasibleSet:
             stamp.reshape(-1),
             source.expand(*self.batch_shape, m).reshape(-1, m),
         )
-        body, shrunk = clipped.body, clipped.shrunk
+        body: Any = clipped.body
+        shrunk = clipped.shrunk
         over = (body.count > self.max_facets).nonzero().squeeze(-1)
         if len(over) > 0:
             merged = joined(body.select(over), self.max_facets)

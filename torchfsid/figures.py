@@ -7,11 +7,14 @@ import json
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
 from torchfsid.kkt import CASES
 
@@ -19,7 +22,7 @@ ROBOT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9
 """Okabe and Ito's colours, readable for the colour-blind; reused in turn beyond eight robots."""
 
 CASE_GREYS = ("#ededed", "#c6c6c6", "#9a9a9a", "#5f5f5f", "#222222")
-STYLE = {
+STYLE: dict[Any, Any] = {
     "font.size": 9,
     "axes.titlesize": 10,
     "axes.titleweight": "bold",
@@ -108,15 +111,12 @@ def _draw_cases(axes: Axes, history: dict[str, dict[str, np.ndarray]]) -> None:
     cases = np.stack([of["case"] for of in history.values()])
     t = next(iter(history.values()))["t"]
     ends = np.append(t, t[-1] + (t[-1] - t[-2] if len(t) > 1 else 1.0))
-    colours = mpl.colors.ListedColormap(CASE_GREYS)
+    colours = ListedColormap(CASE_GREYS)
     axes.pcolormesh(ends, np.arange(len(history) + 1), cases, cmap=colours, vmin=-0.5, vmax=4.5, rasterized=True)
     axes.set_yticks(np.arange(len(history)) + 0.5, list(history))
     axes.invert_yaxis()
     axes.set(xlabel="t [s]", ylabel="robot", title="Case")
-    handles = [
-        mpl.patches.Patch(facecolor=grey, edgecolor="0.5", label=case)
-        for case, grey in zip(CASES, CASE_GREYS, strict=True)
-    ]
+    handles = [Patch(facecolor=grey, edgecolor="0.5", label=case) for case, grey in zip(CASES, CASE_GREYS, strict=True)]
     axes.legend(
         handles=handles,
         ncols=5,

@@ -1,4 +1,4 @@
-r"""The inverse-optimal set: every theta for which the measured control is optimal, up to a bound on its error.
+r"""The inverse-optimal set: every theta for which the measured control is optimal, up to bounds on all errors.
 
     { theta : C theta + d - u  in  cone{a_j : s_j <= slack} (+) ball(velocity) }
 
@@ -7,12 +7,17 @@ C theta + d - u* is in the cone of its active rows (KKT), these are among the ge
 the vector by at most `velocity`. The slack test is one-sided, so violated (soft) rows count as active. Each outward
 normal n of the cone gives one half-space n.(C theta + d - u) <= velocity; the corners of the sum are rounded off by a
 fan of normals, an outer polygon. An intersection over time never forgives one wrong step: unlike the critical region,
-this set is not wrong when a solver is inexact or a row is nearly active. (Not in the paper; see docs/theory.md.)
+this set is not wrong when a solver is inexact or a row is nearly active.
+
+Positions that are known up to a bound turn the rows, move their boundaries and shift C theta + d: the generators become
+fans, the slack test and the ball grow (`Uncertainty`). A clipped nominal control opens the set in the directions of
+saturation (`saturation`). Each widening is an outer one. (Not in the paper; proofs in docs/theory.md.)
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -21,29 +26,56 @@ from torch import Tensor
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.kkt import outward_normals
+from torchfsid.saturation import unclipped
+from torchfsid.tasks import Saturation
 
 FAN = 17
 """Normals around a full turn, ends counted twice: 22.5 degrees apart, 1.3 % more area than the disc they replace."""
 
+SPREAD = (-1.0, -1 / 3, 1 / 3, 1.0)
+"""A row of uncertain direction is a fan of generators at these fractions of its angle: dense enough for any angle."""
+
 
 @dataclass(frozen=True)
 class NoiseBound:
-    """Bounds on the error of the measured control [m/s].
+    """Bounds on the errors of what is measured.
 
     Attributes:
-        velocity: |u - u*|, the residual of stationarity.
-        slack: how far from its boundary an active row may be measured; default: `velocity`.
+        velocity: |u - u*|, of the measured control and of the controller's solver [m/s].
+        slack: how far from its boundary an active row may be measured [m/s]; default: `velocity`.
+        position: of every measured position [m].
+        neighbour_velocity: of the velocities of other bodies, where rows use them [m/s].
     """
 
     velocity: float
     slack: float
+    position: float
+    neighbour_velocity: float
 
-    def __init__(self, velocity: float, slack: float | None = None):
+    def __init__(
+        self, velocity: float, slack: float | None = None, position: float = 0.0, neighbour_velocity: float = 0.0
+    ):
         slack = velocity if slack is None else slack
-        if not (velocity >= 0 and slack >= 0):
-            raise InputError("noise", "bounds >= 0 [m/s]", (velocity, slack))
-        object.__setattr__(self, "velocity", velocity)
-        object.__setattr__(self, "slack", slack)
+        bounds = {"velocity": velocity, "slack": slack, "position": position, "neighbour_velocity": neighbour_velocity}
+        for name, bound in bounds.items():
+            if not bound >= 0:
+                raise InputError(f"noise.{name}", "a bound >= 0", bound)
+            object.__setattr__(self, name, bound)
+
+
+class Uncertainty(NamedTuple):
+    """What the bounds come to at one instant, on top of `NoiseBound.velocity` and `.slack`.
+
+    Attributes:
+        velocity: more error of the control [m/s].
+        slack: more error of each row's slack [m/s]. angle: error of each row's direction [rad].
+        drift: error of C theta + d [m/s].
+    """
+
+    velocity: Float[Tensor, "*batch"]
+    slack: Float[Tensor, "*batch m"]
+    angle: Float[Tensor, "*batch m"]
+    drift: Float[Tensor, "*batch"]
 
 
 def inverse_optimal_set(
@@ -52,14 +84,47 @@ def inverse_optimal_set(
     C: Float[Tensor, "*batch n p"],
     d: Float[Tensor, "*batch n"],
     noise: NoiseBound,
+    *,
+    uncertainty: Uncertainty | None = None,
+    saturation: Saturation | None = None,
+    possible: Float[Tensor, "*batch v n"] | None = None,
 ) -> Halfspaces:
-    """The set as half-spaces of theta, `FAN` + 1 rows, unneeded ones padded. Controls are planar (n = 2); p is any.
+    """The set as half-spaces of theta, unneeded rows padded. Controls are planar (n = 2); p is any.
 
-    `source` is m + j where a half-space comes from the multiplier of row j, 2 m where no row may be active.
+    `source` is m + j where a half-space comes from the multiplier of row j, 2 m where no single row is to blame.
+
+    Args:
+        uncertainty: what position errors and the like add to `noise`; its own `position` and `neighbour_velocity` are
+            not looked at here, the observer turns them into this.
+        saturation: the nominal control is clipped. possible: points whose convex hull holds every C theta + d that is
+            still possible [m/s], required with a saturation.
+
+    Raises:
+        InputError: a saturation without `possible`, or controls that are not planar.
     """
     u, C, d = u.to(torch.float64), C.to(torch.float64), d.to(torch.float64)
-    is_row = (safe_controls.A != 0).any(-1)
-    may_be_active = is_row & (safe_controls.slack(u) <= noise.slack)
-    normals, generator = outward_normals(safe_controls.A, may_be_active, FAN)
-    b = noise.velocity - (normals @ (d - u).unsqueeze(-1)).squeeze(-1)
-    return Halfspaces(normals @ C, b, safe_controls.rows + generator).where((normals != 0).any(-1))
+    m, generators = safe_controls.rows, safe_controls.A
+    slack, ball, drift = u.new_tensor(noise.slack), u.new_tensor(noise.velocity), u.new_zeros(())
+    if uncertainty is not None:
+        slack, ball, drift = slack + uncertainty.slack, ball + uncertainty.velocity, uncertainty.drift
+    may_be_active = (generators != 0).any(-1) & (safe_controls.slack(u) <= slack)
+    if uncertainty is not None:
+        generators = torch.cat([_turned(generators, fraction * uncertainty.angle) for fraction in SPREAD], dim=-2)
+        may_be_active = torch.cat([may_be_active] * len(SPREAD), dim=-1)
+
+    normals, generator = outward_normals(generators, may_be_active, FAN)
+    source = m + torch.where(generator < generators.shape[-2], generator % m, m)
+    along_u = (normals @ u.unsqueeze(-1)).squeeze(-1)
+    nominal = Halfspaces(normals, along_u + ball.unsqueeze(-1), source).where((normals != 0).any(-1))
+    if saturation is not None:
+        if possible is None:
+            raise InputError("possible", "the nominal controls that are still possible, for a saturation", None)
+        nominal = unclipped(nominal, saturation, possible, drift)
+    is_row = (nominal.A != 0).any(-1)
+    return Halfspaces(nominal.A, nominal.b + drift.unsqueeze(-1) * is_row, nominal.source).pullback(C, d)
+
+
+def _turned(rows: Float[Tensor, "*batch m 2"], angle: Float[Tensor, "*batch m"]) -> Float[Tensor, "*batch m 2"]:
+    cos, sin = angle.cos(), angle.sin()
+    x, y = rows.unbind(-1)
+    return torch.stack([cos * x - sin * y, sin * x + cos * y], dim=-1)

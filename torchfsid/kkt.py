@@ -42,8 +42,7 @@ class KktSolution:
 
     Attributes:
         G, f: u*(theta) = G theta + f.
-        pinv: A_a^+ of the unit active rows (inactive columns are zero).
-        projector: P = A_a^+ A_a, onto the span of the active rows.
+        projector: P = A_a^+ A_a, onto the span of the active rows. free: I - P, exactly zero at full rank.
         offset: A_a^+ b_a, the part of u* that the active rows decide [m/s].
         active: the active rows. n_active: K, their number. rank: of A_a.
         case: index into `CASES`.
@@ -51,8 +50,8 @@ class KktSolution:
 
     G: Float[Tensor, "*batch n p"]
     f: Float[Tensor, "*batch n"]
-    pinv: Float[Tensor, "*batch n m"]
     projector: Float[Tensor, "*batch n n"]
+    free: Float[Tensor, "*batch n n"]
     offset: Float[Tensor, "*batch n"]
     active: Bool[Tensor, "*batch m"]
     n_active: Int[Tensor, "*batch"]
@@ -94,8 +93,8 @@ def solve_kkt(
     return KktSolution(
         G=free @ C,
         f=offset + (free @ d.unsqueeze(-1)).squeeze(-1),
-        pinv=pinv,
         projector=projector,
+        free=free,
         offset=offset,
         active=active,
         n_active=n_active,
@@ -128,10 +127,15 @@ def outward_normals(
     if fan < 3:
         raise InputError("fan", "at least 3 normals (two ends and a cap)", fan)
     m = generators.shape[-2]
+    if m == 0:  # nothing to sort: one slot that holds no generator says the same
+        generators, present = (
+            generators.new_zeros(*generators.shape[:-2], 1, 2),
+            present.new_zeros(*present.shape[:-1], 1),
+        )
     count = present.sum(-1, keepdim=True)
     safe = torch.where(present.unsqueeze(-1), generators, 1.0)
     angles, order = torch.where(present, torch.atan2(safe[..., 1], safe[..., 0]), math.inf).sort(-1)
-    slot = torch.arange(m, device=angles.device)
+    slot = torch.arange(angles.shape[-1], device=angles.device)
     following = torch.where(slot == count - 1, angles[..., :1] + 2 * math.pi, angles.roll(-1, -1))
     gaps = torch.where(slot < count, following - angles, -math.inf)
 
@@ -152,5 +156,5 @@ def outward_normals(
     normals = torch.stack([directions.cos(), directions.sin()], dim=-1)
     needed = torch.cat([needed, is_line], dim=-1)
     end = torch.where(widest == count - 1, 0, widest + 1)
-    near = torch.cat([torch.where(step < 0.5, widest, end.clamp(max=m - 1)), second], dim=-1)
+    near = torch.cat([torch.where(step < 0.5, widest, end.clamp(max=len(slot) - 1)), second], dim=-1)
     return OutwardNormals(torch.where(needed.unsqueeze(-1), normals, 0.0), torch.where(none, m, order.gather(-1, near)))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -31,6 +31,8 @@ class Measurement:
         previous_body_velocities: their velocities one sample earlier [m/s]; NaN where unknown.
         radius, body_radii: [m], where known.
         observed: the robot was measured at t (None: all were). Where False, x and u are zeros, never NaN.
+        position_error, body_position_error: bounds on the error of x and of bodies at this instant [m]; None: zero.
+        velocity_error, body_velocity_error: likewise of u and of the bodies' velocities [m/s].
     """
 
     t: float
@@ -43,6 +45,10 @@ class Measurement:
     radius: Float[Tensor, "*batch"] | None = None
     body_radii: Float[Tensor, "*batch m"] | None = None
     observed: Bool[Tensor, "*batch"] | None = None
+    position_error: Float[Tensor, "*batch"] | None = None
+    body_position_error: Float[Tensor, "*batch m"] | None = None
+    velocity_error: Float[Tensor, "*batch"] | None = None
+    body_velocity_error: Float[Tensor, "*batch m"] | None = None
 
     @classmethod
     def of_team(
@@ -55,6 +61,8 @@ class Measurement:
         previous_u: Float[Tensor, "bodies n"] | None = None,
         radius: Float[Tensor, "bodies"] | None = None,
         seen: Bool[Tensor, "bodies"] | None = None,
+        position_error: Float[Tensor, "bodies"] | None = None,
+        velocity_error: Float[Tensor, "bodies"] | None = None,
     ) -> Measurement:
         """The batch of the inferred `robots` (indices; default all) among all bodies of a team.
 
@@ -91,7 +99,19 @@ class Measurement:
             radius=own(radius),
             body_radii=for_each_robot(radius),
             observed=seen[index],
+            position_error=own(position_error),
+            body_position_error=for_each_robot(position_error),
+            velocity_error=own(velocity_error),
+            body_velocity_error=for_each_robot(velocity_error),
         )
+
+
+class ErrorBounds(NamedTuple):
+    """Bounds at one instant: on the robots' positions, on those of the bodies [m], on the bodies' velocities [m/s]."""
+
+    position: Float[Tensor, "*batch"]
+    body_position: Float[Tensor, "*batch m"]
+    body_velocity: Float[Tensor, "*batch m"]
 
 
 @runtime_checkable

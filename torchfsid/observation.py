@@ -86,6 +86,7 @@ class Observation:
             kind=config.set,
             noise=config.noise.build(),
             active_tolerance=config.active_tolerance,
+            on_inconsistent=config.on_inconsistent,
         )
         ukf = ParameterUkf(
             task,

@@ -4,7 +4,9 @@ Per measurement, for all robots in one batch: the barriers give the rows A u <= 
 shows which rows are active, the KKT conditions become half-spaces, and Theta(t) is what they leave of Theta(t-).
 
 What can go wrong with data is reported, never hidden in the set:
-    - an empty intersection: the set stays as it was, the robot's status becomes INCONSISTENT;
+    - an empty intersection: the set stays as it was and the robot's status becomes INCONSISTENT, or, if it is known
+    that
+      robots change their minds, the set starts again from the prior;
     - a hard row violated by more than its bound: model or bounds are wrong, the sample is not used, status ALARM;
     - a controller that failed (it commands exactly zero while a row is violated), a robot or a neighbour's velocity not
       measured: the sample says nothing, it is skipped and counted.
@@ -25,15 +27,16 @@ from torch import Tensor
 from torchfsid.active_set import ACTIVE_TOLERANCE, active_set
 from torchfsid.barriers import Barrier
 from torchfsid.critical_region import critical_region
-from torchfsid.errors import InputError
+from torchfsid.errors import InconsistentError, InputError
 from torchfsid.feasible_set import FeasibleSet
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.inverse_optimal import NoiseBound, inverse_optimal_set
+from torchfsid.inverse_optimal import NoiseBound, Uncertainty, inverse_optimal_set
 from torchfsid.kkt import KktSolution, solve_kkt
-from torchfsid.measurement import Measurement
+from torchfsid.measurement import ErrorBounds, Measurement
 from torchfsid.tasks import Task
 
 SetKind = Literal["critical_region", "inverse_optimal"]
+OnInconsistent = Literal["hold", "reset", "raise"]
 
 
 class Status(IntEnum):
@@ -46,7 +49,7 @@ class Status(IntEnum):
 
 @dataclass(frozen=True)
 class Event:
-    """The first time something went wrong for a robot: when, what, and the evidence.
+    """The first time something went wrong for a robot, or a time at which its set was reset: when, what, the evidence.
 
     `rows` names, as (time, source), the half-spaces that contradict each other (INCONSISTENT) or, for an ALARM, the row
     that is violated; the sources are those of `critical_region` and `inverse_optimal_set`.
@@ -56,6 +59,7 @@ class Event:
     robot: int
     status: Status
     rows: tuple[tuple[float, int], ...]
+    reset: bool = False
 
 
 @dataclass(frozen=True)
@@ -92,6 +96,9 @@ class SetMembershipObserver:
         kind: `critical_region` (the paper's Omega: for exact data of exact controllers) or `inverse_optimal`.
         noise: bounds for `inverse_optimal` and for the alarm.
         active_tolerance: when a row counts as active for `critical_region`, for the case label and for (G, f) [m/s].
+        on_inconsistent: what an empty intersection does: `hold` the set as it was, `reset` it to the prior and go on
+        from
+            there (a change of goal; the status stays OK, the event is recorded), or `raise` an `InconsistentError`.
         status, skipped, events: per robot: `Status`, number of samples without information, first ALARM and
         INCONSISTENT.
 
@@ -105,6 +112,8 @@ class SetMembershipObserver:
     kind: SetKind = "inverse_optimal"
     noise: NoiseBound | None = None
     active_tolerance: float = ACTIVE_TOLERANCE
+    on_inconsistent: OnInconsistent = "hold"
+    prior: FeasibleSet = field(init=False)
     status: Int[Tensor, "B"] = field(init=False)
     skipped: Int[Tensor, "B"] = field(init=False)
     events: list[Event] = field(init=False, default_factory=list)
@@ -116,6 +125,9 @@ class SetMembershipObserver:
             raise InputError("feasible_set", f"a batch (B,) of sets over the task's {p} parameters", actual)
         if self.kind == "inverse_optimal" and self.noise is None:
             raise InputError("noise", "a NoiseBound, since the set is inverse_optimal", None)
+        if self.kind == "critical_region" and self.task.saturation is not None:
+            raise InputError("kind", "inverse_optimal, since the nominal control is clipped", self.kind)
+        self.prior = self.feasible_set
         self.status = torch.zeros(self.feasible_set.batch_shape, dtype=torch.long)
         self.skipped = torch.zeros_like(self.status)
 
@@ -130,30 +142,46 @@ class SetMembershipObserver:
             raise InputError("measurement", "finite positions and velocities", f"none or not finite at t = {t}")
         parts = [barrier(measurement) for barrier in self.barriers]
         rows = Halfspaces.stack(parts)
-        known = rows.b.isfinite() & rows.A.isfinite().all(-1)
-        safe_controls = rows.where(known)
+        C, d = self.task(measurement)
+        evaluated = rows.b.isfinite() & rows.A.isfinite().all(-1)
+        wish_known = C.isfinite().all(-1).all(-1) & d.isfinite().all(-1)
+        safe_controls = rows.where(evaluated)
+        C, d = torch.where(wish_known[:, None, None], C, 0.0), torch.where(wish_known[:, None], d, 0.0)
         slack = safe_controls.slack(u)
+        uncertainty = self._uncertainty(measurement)
         hard = torch.cat([torch.full((part.rows,), not b.soft) for part, b in zip(parts, self.barriers, strict=True)])
         bound = self.active_tolerance if self.noise is None else self.noise.slack
+        if uncertainty is not None:
+            bound = bound + uncertainty.slack
         broken = (slack < -bound) & hard
         failed = (u == 0).all(-1) & (slack < 0).any(-1)
-        measured = known.all(-1) & ~failed
+        measured = evaluated.all(-1) & wish_known & ~failed
         if measurement.observed is not None:
             measured = measured & measurement.observed
         alarmed = measured & broken.any(-1)
         informative = measured & ~alarmed
 
-        C, d = self.task(measurement)
         active = active_set(safe_controls, u, self.active_tolerance)
         if self.kind == "critical_region":
             omega = critical_region(safe_controls, active, C, d)
         else:
             assert self.noise is not None
-            omega = inverse_optimal_set(safe_controls, u, C, d, self.noise)
-        narrowed = self.feasible_set.intersect(omega.where(informative.unsqueeze(-1)), time=t)
+            omega = inverse_optimal_set(
+                safe_controls,
+                u,
+                C,
+                d,
+                self.noise,
+                uncertainty=uncertainty,
+                saturation=self.task.saturation,
+                possible=None if self.task.saturation is None else self._possible(C, d),
+            )
+        omega = omega.where(informative.unsqueeze(-1))
+        narrowed = self.feasible_set.intersect(omega, time=t)
         contradicted = narrowed.is_empty
         self._report(t, alarmed, slack, narrowed)
-        self.feasible_set = narrowed.where(~contradicted, self.feasible_set)
+        instead = self.feasible_set if self.on_inconsistent == "hold" else self.prior
+        self.feasible_set = narrowed.where(~contradicted, instead)
         self.skipped = self.skipped + (~informative).long()
         kkt = solve_kkt(safe_controls, active, C, d)
         return SetEstimate(t, self.feasible_set, kkt, informative & ~contradicted, self.status)
@@ -164,8 +192,44 @@ class SetMembershipObserver:
         for robot in (alarmed & (self.status < Status.ALARM)).nonzero().flatten().tolist():
             row = int(slack[robot].argmin())
             self.events.append(Event(t, robot, Status.ALARM, ((t, row),)))
+        reset = self.on_inconsistent == "reset"
         for robot in (narrowed.is_empty & (self.status < Status.INCONSISTENT)).nonzero().flatten().tolist():
             rows = tuple(zip(evidence.time[robot].tolist(), evidence.source[robot].tolist(), strict=True))
-            self.events.append(Event(t, robot, Status.INCONSISTENT, rows))
+            self.events.append(Event(t, robot, Status.INCONSISTENT, rows, reset))
+            if self.on_inconsistent == "raise":
+                raise InconsistentError(
+                    f"robot {robot} at t = {t}: no parameter explains the measurements; rows {rows}"
+                )
         self.status = torch.where(alarmed, self.status.clamp(min=Status.ALARM), self.status)
-        self.status = torch.where(narrowed.is_empty, Status.INCONSISTENT, self.status)
+        if not reset:
+            self.status = torch.where(narrowed.is_empty, Status.INCONSISTENT, self.status)
+
+    def _possible(self, C: Float[Tensor, "B n p"], d: Float[Tensor, "B n"]) -> Float[Tensor, "B v n"]:
+        """C theta + d at the corners of Theta."""
+        return self.feasible_set.vertices() @ C.mT + d.unsqueeze(-2)
+
+    def _uncertainty(self, measurement: Measurement) -> Uncertainty | None:
+        """What bounds beyond those on the control come to, for the rows and for C theta + d; None if there are none."""
+        noise = NoiseBound(0.0) if self.noise is None else self.noise
+        measured = (measurement.position_error, measurement.body_position_error)
+        measured += (measurement.velocity_error, measurement.body_velocity_error)
+        if noise.position == noise.neighbour_velocity == 0 and all(error is None for error in measured):
+            return None
+        own, bodies = torch.zeros_like(measurement.x[..., 0]), torch.zeros_like(measurement.bodies[..., 0])
+
+        def total(declared: float, measured: Tensor | None, like: Tensor) -> Tensor:
+            return like + declared + (0.0 if measured is None else measured)
+
+        bounds = ErrorBounds(
+            total(noise.position, measurement.position_error, own),
+            total(noise.position, measurement.body_position_error, bodies),
+            total(noise.neighbour_velocity, measurement.body_velocity_error, bodies),
+        )
+        rows = [barrier.errors(measurement, bounds) for barrier in self.barriers]
+        velocity = total(0.0, measurement.velocity_error, own)
+        return Uncertainty(
+            velocity=velocity,
+            slack=torch.cat([row.slack for row in rows], dim=-1) + velocity.unsqueeze(-1),
+            angle=torch.cat([row.angle for row in rows], dim=-1),
+            drift=self.task.drift(bounds, self.feasible_set.vertices().abs().amax(-2)),
+        )

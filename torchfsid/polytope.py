@@ -42,9 +42,10 @@ OPEN = 1e-9
 """The normals of a closed surface times their areas add up to zero: to this share of its area."""
 
 REACH = 100.0
-"""A set that would grow this many times longer without a facet is taken to be unbounded without it."""
+"""What happens beyond this many times the size of a set is out of its sight: a set that grows further without a facet
+is taken to be unbounded without it, and rows that only meet further away contradict each other."""
 
-CANDIDATES = 8
+CANDIDATES = 4
 """Of the facets that could be dropped, this many, the smallest, are compared by the volume that they keep out."""
 
 Reals = NDArray[np.float64]
@@ -101,7 +102,7 @@ class Polytope:
     def _of(cls, cells: list[_Cell], dim: int, device: torch.device) -> Polytope:
         """The batch of these cells, padded to the largest. It keeps them, and what is already known about them."""
         counts = np.array([[len(cell.b), len(cell.vertices)] for cell in cells], dtype=np.int64).reshape(-1, 2)
-        B, (F, V) = len(cells), counts.max(0, initial=0)
+        B, (F, V) = len(cells), counts.max(0, initial=1)
         A, b, time = np.zeros((B, F, dim)), np.ones((B, F)), np.full((B, F), nan)
         source, vertices, incident = np.full((B, F), PRIOR), np.zeros((B, V, dim)), np.zeros((B, V, F), dtype=bool)
         for i, (cell, (f, v)) in enumerate(zip(cells, counts, strict=True)):
@@ -139,7 +140,8 @@ class Polytope:
 
     def diameter(self) -> Float[Tensor, "B"]:
         """Largest distance between two points of the set."""
-        return (self.vertices.unsqueeze(1) - self.vertices.unsqueeze(2)).norm(dim=-1).flatten(1).amax(-1)
+        apart = torch.cdist(self.vertices, self.vertices, compute_mode="donot_use_mm_for_euclid_dist")
+        return apart.flatten(1).amax(-1)
 
     def support(self, direction: Float[Tensor, "B D p"]) -> Float[Tensor, "B D"]:
         """Support function h(n) = max n.z over the set."""
@@ -151,8 +153,8 @@ class Polytope:
         The radius is the distance from the returned centre to the nearest facet. Where the centre is not unique, an end
         of the set of centres is returned. Raises `SolverError` if HiGHS finds no solution.
         """
-        balls = [_inscribed_ball(cell) for cell in self._cells]
-        return self._tensor([centre for centre, _ in balls], self.dim), self._tensor([radius for _, radius in balls])
+        centres, radii = [cell.ball[0] for cell in self._cells], [cell.ball[1] for cell in self._cells]
+        return self._tensor(centres, self.dim), self._tensor(radii)
 
     def nearest(
         self, point: Float[Tensor, "B p"], metric: Float[Tensor, "B p p"] | None = None
@@ -222,9 +224,9 @@ def merge_polytope(polytope: Polytope, most: int) -> Polytope:
     cells = list(polytope._cells)
     for i, cell in enumerate(cells):
         larger: _Cell | None = cell
-        while larger is not None and len(larger.b) > most:
-            larger, cells[i] = _without_cheapest_facet(larger), larger
-        cells[i] = cells[i] if larger is None else larger
+        while larger is not None:
+            cells[i] = larger
+            larger = _without_cheapest_facet(larger) if len(larger.b) > most else None
     return Polytope._of(cells, polytope.dim, polytope.A.device)
 
 
@@ -263,6 +265,26 @@ class _Cell:
             volume, middle, _ = _pyramids(*_joggled(rows / (self.b - self.A @ centre)[:, None]))
         return volume * float(scale.prod()), centre + (middle * scale) @ axes
 
+    @cached_property
+    def ball(self) -> tuple[Reals, float]:
+        """Centre and radius of a largest inscribed ball."""
+        centre, axes, scale = self.frame
+        scale = np.where(scale > 0, scale, 1.0)
+        rows, lengths = self.A @ (axes.T * scale), _lengths(self.A)
+        norms = _lengths(rows)
+        result = linprog(
+            np.append(np.zeros(len(centre)), -1.0),
+            A_ub=np.column_stack([rows, lengths * scale.min()]) / norms[:, None],
+            b_ub=(self.b - self.A @ centre) / norms,
+            bounds=(None, None),
+            method="highs-ds",
+            options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
+        )
+        if result.status != 0:
+            raise SolverError(f"HiGHS found no inscribed ball of a set: {result.message}")
+        middle = centre + (result.x[:-1] * scale) @ axes
+        return middle, max(0.0, float(((self.b - self.A @ middle) / lengths).min()))
+
 
 def _pyramids(y: Reals, incident: Mask) -> tuple[float, Reals, Reals]:
     """Volume, centroid and the areas of the facets, from the vertices and which facets each is on."""
@@ -275,8 +297,8 @@ def _pyramids(y: Reals, incident: Mask) -> tuple[float, Reals, Reals]:
             is_side &= ~incident[apex]
         parent, facet = np.nonzero(is_side)
         sides = faces[parent] & incident.T[facet]
-        _, first, child = np.unique(np.packbits(sides, axis=1), axis=0, return_index=True, return_inverse=True)
-        child = child.reshape(-1)
+        keys = np.packbits(sides, axis=1)  # sorted as strings of bytes: faster than as rows
+        _, first, child = np.unique(keys.view(f"S{keys.shape[1]}")[:, 0], return_index=True, return_inverse=True)
         _, once = np.unique(parent * len(first) + child, return_index=True)
         descent.append((apex, parent[once], child[once], facet[once]))
         faces = sides[first]
@@ -312,25 +334,6 @@ def _joggled(dual: Reals) -> tuple[Reals, Mask]:
     incident = np.zeros((len(hull.simplices), len(dual)), dtype=bool)
     np.put_along_axis(incident, hull.simplices, True, axis=1)
     return -hull.equations[:, :-1] / hull.equations[:, -1:], incident
-
-
-def _inscribed_ball(cell: _Cell) -> tuple[Reals, float]:
-    centre, axes, scale = cell.frame
-    scale = np.where(scale > 0, scale, 1.0)
-    rows, lengths = cell.A @ (axes.T * scale), _lengths(cell.A)
-    norms = _lengths(rows)
-    result = linprog(
-        np.append(np.zeros(len(centre)), -1.0),
-        A_ub=np.column_stack([rows, lengths * scale.min()]) / norms[:, None],
-        b_ub=(cell.b - cell.A @ centre) / norms,
-        bounds=(None, None),
-        method="highs-ds",
-        options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
-    )
-    if result.status != 0:
-        raise SolverError(f"HiGHS found no inscribed ball of a set: {result.message}")
-    middle = centre + (result.x[:-1] * scale) @ axes
-    return middle, max(0.0, float(((cell.b - cell.A @ middle) / lengths).min()))
 
 
 def _nearest(cell: _Cell, point: Reals, metric: Reals) -> Reals:
@@ -434,8 +437,12 @@ def _contradiction(cell: _Cell, row: _Row) -> tuple[Reals, ...]:
     rows = A @ (axes.T * np.where(scale > 0, scale, 1.0))
     norms = _lengths(rows)
     rows, right = rows / norms[:, None], (b - A @ centre) / norms
-    y = np.append(1.0, nnls(rows[1:].T, -rows[0])[0])
-    if y @ right + np.linalg.norm(y @ rows) * REACH >= 0:
+    try:
+        y = np.append(1.0, nnls(rows[1:].T, -rows[0])[0])
+    except RuntimeError:  # it stalled: undecided
+        return ()
+    noise = y @ (_round_off(A, b, cell.vertices) / norms) + REACH * np.linalg.norm(y @ rows)
+    if y @ right >= -noise:
         return ()
     used = y > 0
     time, source = np.append(row.time, cell.time[at]), np.append(row.source, cell.source[at])
@@ -459,11 +466,11 @@ def _without_cheapest_facet(cell: _Cell) -> _Cell | None:
         added = 0.0 if 0 not in beyond.source else inf if PRIOR in beyond.source else beyond.measure[0]
         if added < least:
             cheapest, least = facet, added
-    if least == inf:
-        return None
     others = np.arange(len(cell.b)) != cheapest
     A, b = cell.A[others], cell.b[others]
     larger = _nearby(_nearby(cell, A, b, REACH), A, b, 2.0)  # the second time with the round-off of its own size
+    if least == inf or PRIOR in larger.source:
+        return None
     return replace(larger, time=cell.time[others][larger.source], source=cell.source[others][larger.source])
 
 

@@ -37,7 +37,7 @@ from torchfsid.errors import InputError, SolverError
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.kkt import solve_kkt
 from torchfsid.measurement import Measurement
-from torchfsid.tasks import Task
+from torchfsid.tasks import Saturation, Task
 
 FLOOR = 1e-8
 """Noises per step are at least this fraction of the position noise (x) and of the prior's spread (theta)."""
@@ -211,12 +211,14 @@ class ParameterUkf:
         slack = safe_controls.slack(u)
         failed = (u == 0).all(-1) & (slack < 0).any(-1)
         known = (known & ~failed & (slack >= -self.active_tolerance).all(-1)).tolist()
+        clip = self.task.saturation
         if self.qp_inside:
             items = zip(safe_controls.A, safe_controls.b, C, d, strict=True)
-            moving = [_QpMotion(Halfspaces(A, b), C_i, d_i) for A, b, C_i, d_i in items]
+            moving = [_QpMotion(_Wish(C_i, d_i, clip), Halfspaces(A, b)) for A, b, C_i, d_i in items]
         else:
             kkt = solve_kkt(safe_controls, active_set(safe_controls, u, self.active_tolerance), C, d)
-            moving = [_AffineMotion(G, f) for G, f in zip(kkt.G.numpy(), kkt.f.numpy(), strict=True)]
+            items = zip(kkt.free, kkt.offset, C, d, strict=True)
+            moving = [_ObservedMotion(_Wish(C_i, d_i, clip), free, offset) for free, offset, C_i, d_i in items]
         return [motion if readable else None for motion, readable in zip(moving, known, strict=True)]
 
     def _update_robot(self, i: int, dt: float, position: Array | None) -> FilterStatus:
@@ -263,26 +265,39 @@ class _Filter(UnscentedKalmanFilter):
 
 
 @dataclass(frozen=True)
-class _AffineMotion:
-    """u = G theta + f."""
+class _Wish:
+    """uhat = C theta + d, clipped if the task says so."""
 
-    G: Array
-    f: Array
+    C: Float[Tensor, "n p"]
+    d: Float[Tensor, "n"]
+    clip: Saturation | None
+
+    def __call__(self, theta: Array) -> Float[Tensor, "s n"]:
+        wish = torch.from_numpy(theta) @ self.C.T + self.d
+        return wish if self.clip is None else self.clip(wish)
+
+
+@dataclass(frozen=True)
+class _ObservedMotion:
+    """u = (I - P) uhat + A_a^+ b_a, which is G theta + f where nothing is clipped."""
+
+    wish: _Wish
+    free: Float[Tensor, "n n"]
+    offset: Float[Tensor, "n"]
 
     def __call__(self, theta: Array) -> Array:
-        return theta @ self.G.T + self.f
+        return (self.wish(theta) @ self.free.T + self.offset).numpy()
 
 
 @dataclass(frozen=True)
 class _QpMotion:
-    """u = argmin |u - (C theta + d)|^2 over the safe controls; zero where there are none."""
+    """u = argmin |u - uhat|^2 over the safe controls; zero where there are none."""
 
+    wish: _Wish
     safe_controls: Halfspaces
-    C: Float[Tensor, "n p"]
-    d: Float[Tensor, "n"]
 
     def __call__(self, theta: Array) -> Array:
-        return solve_safe_qp(self.safe_controls, torch.from_numpy(theta) @ self.C.T + self.d).u.numpy()
+        return solve_safe_qp(self.safe_controls, self.wish(theta)).u.numpy()
 
 
 def _move(states: Array, dt: float, motion: Motion, n: int) -> Array:

@@ -21,7 +21,7 @@ SHADOW = 20.0
 
 
 def draw_cases(results: Results, config: CasesConfig) -> Figure:
-    """A column per case: the rows over the control half-way through, the final sets over the goal, lengths over time."""
+    """A column per case: the rows over the control half-way through, the final sets over the goal, and lengths."""
     count = len(config.cases)
     figure = Figure(figsize=(1.62 * count + 0.6, 6.3), layout="constrained")
     axes = figure.subplots(3, count, height_ratios=(1, 1, 0.9))
@@ -32,7 +32,7 @@ def draw_cases(results: Results, config: CasesConfig) -> Figure:
         _draw_sets(axes[1, i], results, i)
         _draw_lengths(axes[2, i], results.t, {name: values[:, i] for name, values in measures.items()})
         axes[0, i].set_title(case.name, fontweight="bold", loc="center")
-        axes[1, i].set_title(_verdict(measured[i]), loc="center", fontsize=8)
+        _set_verdict(axes[1, i], measured[i])
         axes[2, i].sharey(axes[2, 0])
         for axis in axes[:, i] if i else ():
             axis.tick_params(labelleft=False)
@@ -40,7 +40,7 @@ def draw_cases(results: Results, config: CasesConfig) -> Figure:
     axes[1, 0].set_ylabel("goal y [m]")
     axes[2, 0].set_ylabel("[m]")
     figure.suptitle(
-        f"{config.title}: can a point estimator learn, does the paper's region shrink (in brackets: the paper's answer)",
+        f"{config.title}: can a point estimator learn, does the paper's region shrink? (In brackets: the paper)",
         fontsize=9,
         x=0.01,
         ha="left",
@@ -55,15 +55,21 @@ def draw_cases(results: Results, config: CasesConfig) -> Figure:
         Patch(facecolor="#BFE7DC", edgecolor=REGION),
         Patch(facecolor="none", edgecolor=INVERSE_OPTIMAL),
     ]
-    labels = ["active row", "inactive row", "nominal control", "control", "goal", "UKF", "paper's region", "inverse-optimal set"]
+    controls = ["active row", "inactive row", "nominal control", "control"]
+    labels = [*controls, "goal", "UKF", "paper's region", "inverse-optimal set"]
     lines, names = axes[2, 0].get_legend_handles_labels()
     figure.legend([*handles, *lines], [*labels, *names], loc="outside lower center", ncols=7, columnspacing=1.4)
     return figure
 
 
-def _verdict(measured: dict[str, Any]) -> str:
-    point, region = ((measured[f"{what}_measured"], measured[f"{what}_paper"]) for what in ("point", "region"))
-    return f"point {point[0]} ({point[1]})\nregion {region[0]} ({region[1]})"
+def _set_verdict(axes: Axes, measured: dict[str, Any]) -> None:
+    answers = [(measured[f"{what}_measured"], measured[f"{what}_paper"]) for what in ("point", "region")]
+    (point, point_paper), (region, region_paper) = answers
+    agrees = all(ours == theirs for ours, theirs in answers)
+    text = f"point: {point} ({point_paper})\nregion: {region} ({region_paper})"
+    axes.set_title(
+        text, loc="center", fontsize=8, color="black" if agrees else "#B00020", fontweight=None if agrees else "bold"
+    )
 
 
 def _draw_rows(axes: Axes, region: Region, reach: float) -> None:
@@ -72,7 +78,9 @@ def _draw_rows(axes: Axes, region: Region, reach: float) -> None:
     for (a_x, a_y, b), active in zip(region.rows, on, strict=True):
         normal, along, far = np.array([a_x, a_y]), np.array([-a_y, a_x]), SHADOW * reach
         edge = np.array([b * normal - far * along, b * normal + far * along])
-        axes.add_patch(Polygon([*edge, *(edge[::-1] + far * normal)], facecolor="0.2" if active else "0.6", alpha=0.13, lw=0))
+        axes.add_patch(
+            Polygon([*edge, *(edge[::-1] + far * normal)], facecolor="0.2" if active else "0.6", alpha=0.13, lw=0)
+        )
         axes.plot(*edge.T, color=ACTIVE if active else "0.65", lw=1.8 if active else 0.9, zorder=2)
     axes.plot(*np.array([region.nominal, region.u]).T, color="0.3", lw=0.8, ls=(0, (2, 1.5)), zorder=3)
     axes.plot(*region.nominal, "o", color="black", mfc="white", ms=5.5, zorder=4)
@@ -92,7 +100,9 @@ def _draw_sets(axes: Axes, results: Results, i: int) -> None:
     axes.plot(*path[-1], "x", color=UKF, ms=6, mew=1.6, zorder=8)
     add_goal(axes, results.goals[i])
     margin = 0.06 * (right - left)
-    axes.set(xlim=(left - margin, right + margin), ylim=(bottom - margin, top + margin), aspect="equal", xlabel="goal x [m]")
+    axes.set(
+        xlim=(left - margin, right + margin), ylim=(bottom - margin, top + margin), aspect="equal", xlabel="goal x [m]"
+    )
 
 
 def _draw_lengths(axes: Axes, t: np.ndarray, measures: dict[str, np.ndarray]) -> None:

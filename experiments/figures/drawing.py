@@ -15,7 +15,7 @@ from matplotlib.patches import Circle, Polygon
 from experiments.config import SceneConfig
 from experiments.figures.style import ACTIVE, INACTIVE
 from experiments.saved import Results
-from torchfsid.config import (AvoidanceConfig)
+from torchfsid.config import AvoidanceConfig
 
 NO_RADIUS = 0.1
 """Radius of a disc in a scene without safety distance [m]."""
@@ -49,10 +49,11 @@ def add_obstacles(axes: Axes, config: SceneConfig) -> list[Circle]:
     """Inactive obstacles, in the order of the config, each with its name."""
     discs = []
     for obstacle in config.obstacles:
-        disc = Circle(obstacle.position, disc_radius(config), facecolor=INACTIVE, edgecolor="0.55", lw=0.6, zorder=2)
+        x, y = obstacle.position
+        disc = Circle((x, y), disc_radius(config), facecolor=INACTIVE, edgecolor="0.55", lw=0.6, zorder=2)
         axes.add_patch(disc)
         discs.append(disc)
-        axes.text(*obstacle.position, obstacle.name, ha="center", va="center", fontsize=7, color="0.35", zorder=4)
+        axes.text(x, y, obstacle.name, ha="center", va="center", fontsize=7, color="0.35", zorder=4)
     return discs
 
 

@@ -1,4 +1,4 @@
-"""The paper's figure of a scene with one robot: snapshots, under each the whole region, and the comparison of errors."""
+"""The paper's figure of a scene with one robot: snapshots, under each the whole region, and all errors over time."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from experiments.figures.style import (
     length,
 )
 from experiments.lengths import lengths
-from experiments.saved import Results
+from experiments.saved import SETS, Results
 
 ASPECT = 1.25
 """Width / height of the maps."""
@@ -93,12 +93,14 @@ def _draw_region(axes: Axes, results: Results, k: int, box: tuple[np.ndarray, np
     vertices = np.vstack([region.vertices["critical_region"] - goal, np.zeros((1, 2))])
     frame(axes, padded(vertices.min(0), vertices.max(0), ASPECT, 1.25))
     (left, bottom), (right, top) = box - goal
-    axes.add_patch(Rectangle((left, bottom), right - left, top - bottom, fill=False, ec="0.45", lw=0.7, ls=(0, (1, 1.5))))
+    axes.add_patch(
+        Rectangle((left, bottom), right - left, top - bottom, fill=False, ec="0.45", lw=0.7, ls=(0, (1, 1.5)))
+    )
     axes.set_xlabel("x − goal [m]")
     axes.locator_params(nbins=5)
-    for kind, side in (("critical_region", "left"), ("inverse_optimal", "right")):
-        size = length(np.sqrt(results.of_set(kind, "volume")[k, 0]))
-        axes.set_title(f"√area {size}", loc=side, color=SET_COLOURS[kind], fontsize=8)
+    region_size, other_size = (length(np.sqrt(results.of_set(kind, "volume")[k, 0])) for kind in SETS)
+    axes.set_title(f"√area {region_size}", loc="left", color=REGION, fontsize=8)
+    axes.set_title(f"√area {other_size}", loc="right", color=INVERSE_OPTIMAL, fontsize=8)
 
 
 def _add_estimates(axes: Axes, results: Results, k: int, origin: np.ndarray) -> None:
@@ -118,7 +120,16 @@ def draw_errors(axes: Axes, results: Results, samples: list[int]) -> None:
     for column, k in enumerate(samples):
         axes.axvline(results.t[k], color="0.6", lw=0.7, ls=(0, (1, 1.5)), zorder=0)
         letter = f"({chr(ord('a') + column)})"
-        axes.text(results.t[k], 1.0, letter, transform=axes.get_xaxis_transform(), ha="center", va="bottom", fontsize=7, color="0.4")
+        axes.text(
+            results.t[k],
+            1.0,
+            letter,
+            transform=axes.get_xaxis_transform(),
+            ha="center",
+            va="bottom",
+            fontsize=7,
+            color="0.4",
+        )
     axes.grid(True)
     axes.tick_params(labelbottom=False)
     axes.set_xlim(results.t[0], results.t[-1])
@@ -158,4 +169,6 @@ def _add_legends(figure: Figure, errors: Axes) -> None:
     handles, labels = zip(*entries, strict=True)
     looks = {"handler_map": {tuple: HandlerTuple(None)}, "columnspacing": 1.6}
     figure.legend(handles, labels, loc="outside lower left", ncols=len(entries) // 2, **looks)
-    figure.legend(*errors.get_legend_handles_labels(), loc="outside lower right", ncols=3, columnspacing=1.0, handlelength=2)
+    figure.legend(
+        *errors.get_legend_handles_labels(), loc="outside lower right", ncols=3, columnspacing=1.0, handlelength=2
+    )

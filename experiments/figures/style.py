@@ -1,11 +1,14 @@
-"""How the figures look: Okabe and Ito's colours, which the colour-blind can tell apart, and one kind of line per thing."""
+"""How the figures look: Okabe and Ito's colours, which the colour-blind can tell apart; one kind of line per thing."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-STYLE: dict[str, Any] = {
+if TYPE_CHECKING:
+    from matplotlib.typing import RcKeyType
+
+STYLE: dict[RcKeyType, Any] = {
     "font.size": 8.5,
     "axes.titlesize": 9.5,
     "axes.titlelocation": "left",
