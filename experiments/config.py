@@ -15,18 +15,14 @@ from pydantic import Field, model_validator
 from torchfsid.config import (
     AvoidanceConfig,
     BarrierConfig,
-    BodyName,
     GoalConfig,
     NoiseConfig,
-    NonNegative,
-    Number,
-    PlanarVector,
-    Positive,
     PriorConfig,
     UkfConfig,
 )
 from torchfsid.documents import Strict, apply_overrides, read_yaml, validate, wrong
 from torchfsid.errors import ConfigError
+from torchfsid.quantities import BodyName, NonNegative, Number, PlanarVector, Positive
 
 MAX_STEPS = 1_000_000
 """More is a slip of the pen in dt or duration."""

@@ -70,8 +70,8 @@ def test_truth_is_inside_for_every_error_within_the_bound(delta: float, p: int):
 
 @pytest.mark.parametrize("case", CASES)
 def test_truth_is_inside_for_errors_as_large_as_the_bound(case: str):
-    """9 x 30 scenes x 30 errors. u* is exact here, and |u - u*| <= delta is decided in rationals: nothing is left of the
-    bound, and a row that the error has moved off by all of it must not be missed by round-off."""
+    """9 x 30 scenes x 30 errors. u* is exact here, and |u - u*| <= delta is decided in rationals: nothing of the bound
+    is left, and a row that the error has moved off by all of it must not be missed by round-off."""
     rng, delta, checked, total = np.random.default_rng(CASES.index(case)), 0.1, 0, 0
     for _ in range(30):
         scene = paper_case(case, rng)

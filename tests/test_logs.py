@@ -341,7 +341,7 @@ def test_nothing_is_observed_without_the_leader(write):
 
 def test_what_the_log_does_not_have(write):
     log = read_csv(write("t,robot,x,y\n0,a,0,0\n1,a,0,0\n"))
-    with pytest.raises(LogError, match=r"log\.csv: no columns vx, vy"):
+    with pytest.raises(LogError, match=r"log\.csv: no velocities \(vx, vy\)"):
         log.measurements(["a"], ())
     with pytest.raises(LogError, match="no body is called 'c'"):
         log.differentiated().measurements(["c"], ())

@@ -45,11 +45,16 @@ SCENES = scenes()
 def supports(theta: Halfspaces, around: Tensor) -> Tensor:
     """Supports within a box around each scene's theta, less what the theta itself contributes."""
     b = theta.b - (theta.A @ around.unsqueeze(-1)).squeeze(-1)
-    half = torch.full((len(b), 2), BOX, dtype=torch.float64)
-    clipped = clip(
-        Polygon.from_box(-half, half), theta.A, b, b.new_zeros(len(b)), torch.zeros(b.shape, dtype=torch.long)
-    )
-    return clipped.body.support(DIRECTIONS.expand(len(b), -1, -1))
+    return clipped(theta.A, b, box(len(b), BOX)).support(DIRECTIONS.expand(len(b), -1, -1))
+
+
+def clipped(A: Tensor, b: Tensor, start: Polygon) -> Polygon:
+    return clip(start, A, b, b.new_zeros(len(b)), torch.zeros(b.shape, dtype=torch.long)).body
+
+
+def box(count: int, half: float) -> Polygon:
+    corner = torch.full((count, 2), half, dtype=torch.float64)
+    return Polygon.from_box(-corner, corner)
 
 
 def assert_same_sets(set_of: SetOf, changed: list[Scene]) -> None:
@@ -137,14 +142,10 @@ def test_leading_dimensions(set_of: SetOf):
 @every_set
 def test_no_rows_at_all_are_the_same_as_padding(set_of: SetOf):
     scene = replace(SCENES[0], A=np.zeros((0, 2)), b=np.zeros(0), active=np.zeros(0, dtype=bool))
-    nothing = set_of(*batch([scene], rows=1))
-    safe = Halfspaces(torch.zeros(1, 0, 2), torch.zeros(1, 0))
-    _, active, u, C, d = batch([scene], rows=1)
-    assert torch.allclose(
-        supports(set_of(safe, active[:, :0], u, C, d), true_thetas([scene])),
-        supports(nothing, true_thetas([scene])),
-        atol=1e-12,
-    )
+    padded, around = batch([scene], rows=1), true_thetas([scene])
+    _, active, u, C, d = padded
+    nothing = set_of(Halfspaces(torch.zeros(1, 0, 2), torch.zeros(1, 0)), active[:, :0], u, C, d)
+    assert torch.allclose(supports(nothing, around), supports(set_of(*padded), around), rtol=0, atol=1e-12)
 
 
 @every_set
@@ -166,25 +167,19 @@ def test_float32_is_cast_up_and_gradients_flow_back(set_of: SetOf):
 # Polygons -----------------------------------------------------------------------------------------------------------
 
 
-def clipped(A: Tensor, b: Tensor, box: Polygon) -> Polygon:
-    return clip(box, A, b, b.new_zeros(len(b)), torch.zeros(b.shape, dtype=torch.long)).body
-
-
-def polygon_rows(count: int, rows: int) -> tuple[Tensor, Tensor, Polygon]:
+def polygon_rows(count: int, rows: int) -> tuple[Tensor, Tensor]:
     rng = np.random.default_rng(2)
-    A, b = torch.from_numpy(rng.normal(size=(count, rows, 2))), torch.from_numpy(rng.uniform(0.1, 3, (count, rows)))
-    half = torch.full((count, 2), BOX, dtype=torch.float64)
-    return A, b, Polygon.from_box(-half, half)
+    return torch.from_numpy(rng.normal(size=(count, rows, 2))), torch.from_numpy(rng.uniform(0.1, 3, (count, rows)))
 
 
 def test_polygons_do_not_depend_on_order_scale_or_duplication_of_rows():
-    A, b, box = polygon_rows(50, 7)
+    A, b = polygon_rows(50, 7)
     rng = np.random.default_rng(3)
     order = torch.from_numpy(rng.permuted(np.tile(np.arange(14), (50, 1)), axis=1))
     scale = torch.from_numpy(10 ** rng.uniform(-3, 3, (50, 14)))
     changed_A = (torch.cat([A, A], 1) * scale[..., None]).gather(1, order[..., None].expand(-1, -1, 2))
-    changed = clipped(changed_A, (torch.cat([b, b], 1) * scale).gather(1, order), box)
-    expected = clipped(A, b, box)
+    changed = clipped(changed_A, (torch.cat([b, b], 1) * scale).gather(1, order), box(50, BOX))
+    expected = clipped(A, b, box(50, BOX))
     directions = DIRECTIONS.expand(50, -1, -1)
     assert torch.allclose(changed.support(directions), expected.support(directions), rtol=0, atol=1e-12)
     assert torch.allclose(changed.volume(), expected.volume(), rtol=1e-12)
@@ -193,29 +188,27 @@ def test_polygons_do_not_depend_on_order_scale_or_duplication_of_rows():
 
 def test_polygons_turn_and_move_with_their_rows():
     """A turn about a far point: box and rows as rows of a larger box."""
-    A, b, _ = polygon_rows(50, 7)
+    A, b = polygon_rows(50, 7)
     sides = torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], dtype=torch.float64).expand(50, 4, 2)
     A, b = torch.cat([A, sides], 1), torch.cat([b, torch.full((50, 4), BOX, dtype=torch.float64)], 1)
     cos, sin, shift = np.cos(1.0), np.sin(1.0), torch.tensor([5.0, -7.0], dtype=torch.float64)
     turn = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64)
-    half = torch.full((50, 2), 4 * BOX, dtype=torch.float64)
-    box, directions = Polygon.from_box(-half, half), DIRECTIONS.expand(50, -1, -1)
-    before, after = clipped(A, b, box), clipped(A @ turn.T, b + A @ turn.T @ shift, box)
-    assert torch.allclose(
-        after.support(directions @ turn.T), before.support(directions) + directions @ turn.T @ shift, atol=1e-11
-    )
+    start, turned_rows, directions = box(50, 4 * BOX), A @ turn.T, DIRECTIONS.expand(50, -1, -1)
+    before, after = clipped(A, b, start), clipped(turned_rows, b + turned_rows @ shift, start)
+    expected = before.support(directions) + directions @ turn.T @ shift
+    assert torch.allclose(after.support(directions @ turn.T), expected, atol=1e-11)
     assert torch.allclose(after.volume(), before.volume(), rtol=1e-11)
     assert torch.allclose(after.centroid(), before.centroid() @ turn.T + shift, atol=1e-11)
     assert torch.allclose(after.chebyshev()[1], before.chebyshev()[1], atol=1e-11)
 
 
 def test_a_batch_of_polygons_is_the_loop():
-    A, b, box = polygon_rows(50, 7)
+    A, b = polygon_rows(50, 7)
     A[::3, 4:], b[::3, 4:] = 0.0, 1.0
-    together = clipped(A, b, box)
+    together = clipped(A, b, box(50, BOX))
     for i in range(50):
         rows = 4 if i % 3 == 0 else 7
-        alone = clipped(A[i : i + 1, :rows], b[i : i + 1, :rows], box.select(torch.tensor([i])))
+        alone = clipped(A[i : i + 1, :rows], b[i : i + 1, :rows], box(1, BOX))
         n = int(alone.count)
         assert int(together.count[i]) == n
         assert torch.allclose(together.vertices[i, :n], alone.vertices[0, :n], rtol=0, atol=1e-13)

@@ -36,7 +36,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     commands = parser.add_subparsers(dest="command", required=True)
     observe = commands.add_parser("observe", help="infer the sets of a log's robots")
-    observe.add_argument("log", type=Path, metavar="LOG", help="CSV: t, robot, x, y[, vx, vy][, radius]")
+    observe.add_argument(
+        "log", type=Path, metavar="LOG", help="CSV or Parquet: t, robot, x, y[, vx, vy][, radius]; or a ROS 2 bag"
+    )
     observe.add_argument("--config", type=Path, required=True, help="YAML: task, barriers, prior, noise, ...")
     observe.add_argument("--out", type=Path, required=True, help="results folder")
     observe.add_argument("--set", action="append", default=[], metavar="A.B=VALUE", help="override a key of the config")
@@ -62,11 +64,11 @@ def _observe(log: Path, config: Path, out: Path, overrides: Sequence[str]) -> No
     from rich.console import Console
     from rich.progress import track
 
-    from torchfsid.logs import read_csv
     from torchfsid.observation import Observation
+    from torchfsid.sources import read_log
 
     torch.set_num_threads(1)  # small tensors: more threads only wait for each other
-    observation = Observation(model, read_csv(log))
+    observation = Observation(model, read_log(log, model.bag))
     total = len(observation.log.t)
     for _ in track(observation.run(out), "Observing", total=total, console=Console(stderr=True)):
         pass
@@ -109,6 +111,10 @@ def _print_verdicts(observation: Observation, out: Path) -> None:
     if not console.is_terminal:
         console.width = 160  # a file or a pipe has no width of its own
     console.print(table)
+    if observation.smallest_bounds is not None:
+        robot, bound = max(observation.smallest_bounds.items(), key=lambda item: item[1])
+        used = observation.config.noise.velocity
+        console.print(f"noise.velocity: auto found {bound:.3g} m/s (robot {robot}), used: {used:.3g} m/s")
     console.print(f"Results: {out}/estimates.csv, regions.json, config.yaml, regions.png, regions.pdf")
 
 

@@ -13,41 +13,17 @@ import reprlib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
+from torchfsid.bags import BagConfig
 from torchfsid.documents import Strict, wrong
 from torchfsid.errors import ConfigError
+from torchfsid.quantities import BodyName, Flag, NonNegative, Number, PlanarVector, Positive, Vector, as_number
 
 if TYPE_CHECKING:
     from torchfsid.barriers import Barrier
     from torchfsid.inverse_optimal import NoiseBound
     from torchfsid.tasks import Task
-
-
-def _number(value: object) -> object:
-    """PyYAML takes 1e-6, a number without a dot, for text."""
-    try:
-        return float(value) if isinstance(value, str) else value
-    except ValueError:
-        return value
-
-
-def _name(value: object) -> object:
-    """Bodies are named by text; a whole number stands for the text that writes it."""
-    if isinstance(value, int) and not isinstance(value, bool):
-        return str(value)
-    if not isinstance(value, str) or not value:
-        raise wrong(f"expected a name, got {reprlib.repr(value)} (put names in quotes)")
-    return value
-
-
-Number = Annotated[float, BeforeValidator(_number), Field(strict=True, allow_inf_nan=False)]
-Positive = Annotated[Number, Field(gt=0)]
-NonNegative = Annotated[Number, Field(ge=0)]
-Flag = Annotated[bool, Field(strict=True)]
-BodyName = Annotated[str, BeforeValidator(_name)]
-Vector = Annotated[tuple[Number, ...], Field(min_length=1)]
-PlanarVector = Annotated[tuple[Number, ...], Field(min_length=2, max_length=2)]
 
 
 class NormSaturationConfig(Strict):
@@ -285,18 +261,42 @@ class PriorConfig(Strict):
         return self
 
 
-class NoiseConfig(Strict):
-    """`NoiseBound`: bounds on the errors of controls and slacks [m/s], positions [m], other bodies' velocities [m/s]."""
-
-    velocity: NonNegative
+class _Noise(Strict):
     slack: NonNegative | None = None
     position: NonNegative = 0.0
     neighbour_velocity: NonNegative = 0.0
+
+
+class NoiseConfig(_Noise):
+    """`NoiseBound`: bounds on errors of controls and slacks [m/s], positions [m], other bodies' velocities [m/s]."""
+
+    velocity: NonNegative
 
     def build(self) -> NoiseBound:
         from torchfsid.inverse_optimal import NoiseBound
 
         return NoiseBound(self.velocity, self.slack, self.position, self.neighbour_velocity)
+
+
+class ObservedNoiseConfig(_Noise):
+    """`NoiseConfig` for a log, which may itself say how large the errors in it must be: `velocity: auto`."""
+
+    velocity: float | Literal["auto"]
+
+    @field_validator("velocity", mode="plain")
+    @classmethod
+    def _is_bound_or_auto(cls, value: object) -> object:
+        bound = as_number(value)
+        is_number = isinstance(bound, int | float) and not isinstance(bound, bool) and math.isfinite(bound)
+        if bound != "auto" and not (is_number and bound >= 0):
+            raise wrong(f"expected a bound of at least 0 m/s or 'auto', got {reprlib.repr(value)}")
+        return float(bound) if is_number else bound
+
+    def build(self) -> NoiseBound:
+        """Raises `ConfigError` for `auto`: someone has to find the bound first."""
+        if self.velocity == "auto":
+            raise ConfigError("noise.velocity: expected a number, got 'auto'")
+        return NoiseConfig(**self.model_dump()).build()
 
 
 class UkfConfig(Strict):
@@ -326,27 +326,35 @@ class ObserveConfig(Strict):
         velocity: take velocities from the log, or from differences of its positions.
         obstacles: bodies of the log that are avoided but not inferred.
         on_inconsistent: what an empty intersection does to a set: `hold` it, `reset` it to the prior, or `raise`.
+        bag: where in a ROS bag the bodies are; logs of other kinds do not look at it.
     """
 
     task: TaskConfig
     barriers: Annotated[tuple[BarrierConfig, ...], Field(min_length=1)]
     prior: PriorConfig
-    noise: NoiseConfig
+    noise: ObservedNoiseConfig
     set: Literal["inverse_optimal", "critical_region"] = "inverse_optimal"
     active_tolerance: Positive = 1e-3
     velocity: Literal["logged", "differentiated"] = "logged"
     obstacles: tuple[BodyName, ...] = ()
     on_inconsistent: Literal["hold", "reset", "raise"] = "hold"
+    bag: BagConfig | None = None
     ukf: UkfConfig = UkfConfig()
 
     @model_validator(mode="after")
-    def _prior_fits_task(self) -> ObserveConfig:
+    def _fits_together(self) -> ObserveConfig:
         expected, got = self.task.parameters, len(self.prior.lower)
         if got != expected:
             raise wrong(f"task '{self.task.kind}' has {expected} parameters, lower and upper have {got}", "prior")
         if self.set == "critical_region" and self.task.kind == "goal" and (self.task.saturation or self.task.dead_zone):
             raise wrong("critical_region knows no saturation or dead zone, take inverse_optimal", "set")
+        if self.noise.velocity == "auto" and self.on_inconsistent == "reset":
+            raise wrong("auto takes a change of goal for noise, give a number or take on_inconsistent: hold", "noise")
         return self
+
+    def with_velocity_bound(self, bound: float) -> ObserveConfig:
+        """The configuration with another `noise.velocity` [m/s]."""
+        return self.model_copy(update={"noise": self.noise.model_copy(update={"velocity": bound})})
 
     @property
     def neighbour_velocities(self) -> frozenset[str]:

@@ -16,7 +16,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from torchfsid.errors import ConfigError
+from torchfsid.errors import ConfigError, one_line
 
 
 def wrong(message: str, key: object = None) -> PydanticCustomError:
@@ -184,11 +184,7 @@ def _parse(text: str | bytes, source: str) -> Any:
         return yaml.load(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
-        raise ConfigError(f"{source}: {line}not valid YAML: {_one_line(error.problem or error)}") from error
+        raise ConfigError(f"{source}: {line}not valid YAML: {one_line(error.problem or error)}") from error
     # PyYAML also lets the errors of Python's own constructors through (!!int x, 2001-99-99, very deep nesting ...).
     except (yaml.YAMLError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise ConfigError(f"{source}: not valid YAML: {_one_line(error)}") from error
-
-
-def _one_line(message: object) -> str:
-    return " ".join(str(message).split())
+        raise ConfigError(f"{source}: not valid YAML: {one_line(error)}") from error

@@ -31,3 +31,9 @@ class InconsistentError(FsidError):
 
 class SolverError(FsidError):
     """A third-party solver failed; the original exception is the cause."""
+
+
+def one_line(message: object) -> str:
+    """What somebody else says, on one printable line; an exception without words is named."""
+    text = " ".join(str(message).split()) or type(message).__name__
+    return "".join(character if character.isprintable() else "?" for character in text)

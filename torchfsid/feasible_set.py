@@ -19,8 +19,8 @@ from torch import Tensor
 
 from torchfsid.clipping import Outcome, clip, merge
 from torchfsid.errors import InputError
-from torchfsid.halfspaces import Halfspaces
-from torchfsid.polygon import ROUND_OFF, Polygon
+from torchfsid.halfspaces import ROUND_OFF, Halfspaces
+from torchfsid.polygon import PRIOR, Polygon
 from torchfsid.polytope import Polytope, clip_polytope, merge_polytope
 
 MAX_FACETS = 32
@@ -166,6 +166,19 @@ class FeasibleSet:
             outcome=torch.where(mask, self.outcome, other.outcome),
             contradiction=_choose(mask, self.contradiction, other.contradiction),
             last_cut=torch.where(mask, self.last_cut, other.last_cut),
+        )
+
+    def select(self, items: Int[Tensor, "k"]) -> FeasibleSet:
+        """The sets at these places of a batch (B,); a place may be named more than once."""
+        against = self.contradiction
+        rows = Halfspaces(against.halfspaces.A[items], against.halfspaces.b[items])
+        return replace(
+            self,
+            body=self.body.select(items),
+            batch_shape=items.shape,
+            outcome=self.outcome[items],
+            contradiction=Facets(rows, against.time[items], against.source[items]),
+            last_cut=self.last_cut[items],
         )
 
     def emptiness(self) -> Emptiness:

@@ -17,6 +17,9 @@ from torch import Tensor
 
 from torchfsid.errors import InputError
 
+ROUND_OFF = 8 * torch.finfo(torch.float64).eps
+"""Relative error to allow for in a row's product with a point."""
+
 
 @dataclass(frozen=True)
 class Halfspaces:
@@ -90,6 +93,11 @@ class Halfspaces:
     def slack(self, z: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch m"]:
         """(b_j - a_j.z)/|a_j|: the signed distance of z to each boundary, positive inside, in the units of z."""
         return (self.b - (self.A @ z.to(torch.float64).unsqueeze(-1)).squeeze(-1)) / self.norms()
+
+    def round_off(self, z: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch m"]:
+        """What floating point leaves open about `slack(z)`, in the units of z."""
+        sizes = (self.A.abs() @ z.abs().to(torch.float64).unsqueeze(-1)).squeeze(-1) + self.b.abs()
+        return (ROUND_OFF * sizes / self.norms()).detach()
 
     def contains(self, z: Float[Tensor, "*batch n"], tolerance: float = 0.0) -> Bool[Tensor, "*batch"]:
         """Is z inside, up to a distance `tolerance` (units of z)?"""

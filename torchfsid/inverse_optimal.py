@@ -45,20 +45,26 @@ class NoiseBound:
         slack: how far from its boundary an active row may be measured [m/s]; default: `velocity`.
         position: of every measured position [m].
         neighbour_velocity: of the velocities of other bodies, where rows use them [m/s].
+
+    `velocity` and `slack` may be tensors (*batch,), a bound for each robot.
     """
 
-    velocity: float
-    slack: float
+    velocity: float | Float[Tensor, "*batch"]
+    slack: float | Float[Tensor, "*batch"]
     position: float
     neighbour_velocity: float
 
     def __init__(
-        self, velocity: float, slack: float | None = None, position: float = 0.0, neighbour_velocity: float = 0.0
+        self,
+        velocity: float | Float[Tensor, "*batch"],
+        slack: float | Float[Tensor, "*batch"] | None = None,
+        position: float = 0.0,
+        neighbour_velocity: float = 0.0,
     ):
         slack = velocity if slack is None else slack
         bounds = {"velocity": velocity, "slack": slack, "position": position, "neighbour_velocity": neighbour_velocity}
         for name, bound in bounds.items():
-            if not bound >= 0:
+            if not bool((torch.as_tensor(bound) >= 0).all()):
                 raise InputError(f"noise.{name}", "a bound >= 0", bound)
             object.__setattr__(self, name, bound)
 
@@ -104,10 +110,12 @@ def inverse_optimal_set(
     """
     u, C, d = u.to(torch.float64), C.to(torch.float64), d.to(torch.float64)
     m, generators = safe_controls.rows, safe_controls.A
-    slack, ball, drift = u.new_tensor(noise.slack), u.new_tensor(noise.velocity), u.new_zeros(())
+    slack, ball = per_row(noise.slack, u), per_row(noise.velocity, u).squeeze(-1)
+    drift = u.new_zeros(())
     if uncertainty is not None:
         slack, ball, drift = slack + uncertainty.slack, ball + uncertainty.velocity, uncertainty.drift
-    may_be_active = (generators != 0).any(-1) & (safe_controls.slack(u) <= slack)
+    near = safe_controls.slack(u) <= slack + safe_controls.round_off(u)
+    may_be_active = (generators != 0).any(-1) & near
     if uncertainty is not None:
         generators = torch.cat([_turned(generators, fraction * uncertainty.angle) for fraction in SPREAD], dim=-2)
         may_be_active = torch.cat([may_be_active] * len(SPREAD), dim=-1)
@@ -122,6 +130,11 @@ def inverse_optimal_set(
         nominal = unclipped(nominal, saturation, possible, drift)
     is_row = (nominal.A != 0).any(-1)
     return Halfspaces(nominal.A, nominal.b + drift.unsqueeze(-1) * is_row, nominal.source).pullback(C, d)
+
+
+def per_row(bound: float | Float[Tensor, "*batch"], like: Tensor) -> Float[Tensor, "*batch 1"]:
+    """A bound of `NoiseBound` as a tensor that goes with the rows of a batch."""
+    return torch.as_tensor(bound, dtype=like.dtype, device=like.device).unsqueeze(-1)
 
 
 def _turned(rows: Float[Tensor, "*batch m 2"], angle: Float[Tensor, "*batch m"]) -> Float[Tensor, "*batch m 2"]:

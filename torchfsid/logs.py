@@ -1,6 +1,7 @@
 r"""Logs that someone recorded, as measurements.
 
-One row per body and time, the rows of one time together, times increasing, other columns ignored:
+In a table (CSV, Parquet) one row per body and time, the rows of one time together, times increasing, other columns
+ignored:
 
     t, robot, x, y[, z][, vx, vy[, vz]][, radius]          [s], a name, [m], [m/s], [m]
 
@@ -12,8 +13,6 @@ Nothing here imports torch before the measurements are asked for, so that a wron
 
 from __future__ import annotations
 
-import csv
-import math
 import reprlib
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -24,6 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from torchfsid.errors import LogError
+from torchfsid.tables import CsvTable, ParquetTable, Table, require_column
 
 if TYPE_CHECKING:
     from torchfsid.measurement import Measurement
@@ -42,6 +42,8 @@ class Log:
         seen: the body is there at t.
         velocity_known: and so is its velocity.
         radius: [m]; None if the log has none.
+        position_error, velocity_error: bounds on the errors of x [m] and u [m/s]; None: zero.
+        lost: the body is there at t, but nobody knows where; None: a body that is not seen is not there.
     """
 
     source: str
@@ -52,11 +54,14 @@ class Log:
     seen: Bool[np.ndarray, "times bodies"]
     velocity_known: Bool[np.ndarray, "times bodies"]
     radius: Float[np.ndarray, "bodies"] | None = None
+    position_error: Float[np.ndarray, "times bodies"] | None = None
+    velocity_error: Float[np.ndarray, "times bodies"] | None = None
+    lost: Bool[np.ndarray, "times bodies"] | None = None
 
     @property
     def previous_known(self) -> Bool[np.ndarray, "times bodies"]:
         """The body's velocity one sample earlier is known; so not at the first sample, nor at a body's first."""
-        return np.concatenate([np.zeros_like(self.velocity_known[:1]), self.velocity_known[:-1]])
+        return _one_earlier(self.velocity_known)
 
     def differentiated(self) -> Log:
         """The log with velocities from differences of its positions (module docstring), without its last time.
@@ -82,13 +87,14 @@ class Log:
         A robot is `observed` where its velocity is known, the `required` bodies (the leader of a formation) are there,
         and the `neighbour_velocities` that its barriers use are known: for `current` the velocity of every body that is
         there, for `previous` that of every body that is there (the robot included) one sample earlier. A row with an
-        unknown right-hand side cannot just be left out: it may be the active one, and the set would lose the truth.
+        unknown right-hand side cannot just be left out: it may be the active one, and the set would lose the truth. For
+        the same reason no robot is observed while a body is `lost`.
 
         Raises:
             LogError: the log has no velocities, or no body of that name.
         """
         if self.u is None:
-            raise LogError(f"{self.source}: no columns vx, vy: take `velocity: differentiated`, or log the velocities")
+            raise LogError(f"{self.source}: no velocities (vx, vy): take `velocity: differentiated`, or log them")
         if missing := [name for name in (*robots, *required) if name not in self.bodies]:
             raise LogError(f"{self.source}: no body is called {missing[0]!r}; there are {reprlib.repr(self.bodies)}")
         index, leaders = ([self.bodies.index(name) for name in names] for names in (robots, required))
@@ -97,20 +103,46 @@ class Log:
             observed &= (self.velocity_known | ~self.seen).all(axis=1, keepdims=True)
         if "previous" in neighbour_velocities:
             observed &= (self.previous_known | ~self.seen).all(axis=1, keepdims=True)
-        return self._measurements(self.u, index, observed)
+        if self.lost is not None:
+            observed &= ~self.lost.any(axis=1, keepdims=True)
+        neighbour_error = self.velocity_error
+        if neighbour_error is not None and "previous" in neighbour_velocities:  # one bound serves both moments
+            neighbour_error = np.maximum(neighbour_error, _one_earlier(neighbour_error))
+        return self._measurements(self.u, index, observed, neighbour_error)
 
-    def _measurements(self, velocities: np.ndarray, robots: list[int], observed: np.ndarray) -> Iterator[Measurement]:
+    def _measurements(
+        self, velocities: np.ndarray, robots: list[int], observed: np.ndarray, neighbour_error: np.ndarray | None
+    ) -> Iterator[Measurement]:
         import torch
 
         from torchfsid.measurement import Measurement
 
         x, u, seen, observes = (torch.from_numpy(array) for array in (self.x, velocities, self.seen, observed))
-        radius = None if self.radius is None else torch.from_numpy(self.radius)
-        previous_u = torch.zeros_like(u[0])
+        previous_u = torch.from_numpy(_one_earlier(velocities))
+        radius, x_error, u_error, bodies_u_error = (
+            None if array is None else torch.from_numpy(array)
+            for array in (self.radius, self.position_error, self.velocity_error, neighbour_error)
+        )
         for k, t in enumerate(self.t.tolist()):
-            team = Measurement.of_team(t, x[k], u[k], robots=robots, previous_u=previous_u, radius=radius, seen=seen[k])
+            team = Measurement.of_team(
+                t,
+                x[k],
+                u[k],
+                robots=robots,
+                previous_u=previous_u[k],
+                radius=radius,
+                seen=seen[k],
+                position_error=None if x_error is None else x_error[k],
+                velocity_error=None if u_error is None else u_error[k],
+            )
+            if bodies_u_error is not None:
+                team = replace(team, body_velocity_error=bodies_u_error[k].expand_as(team.present))
             yield replace(team, observed=observes[k])
-            previous_u = u[k]
+
+
+def _one_earlier(values: np.ndarray) -> np.ndarray:
+    """The values of the sample before; zeros before the first."""
+    return np.concatenate([np.zeros_like(values[:1]), values[:-1]])
 
 
 def read_csv(path: str | Path) -> Log:
@@ -119,14 +151,25 @@ def read_csv(path: str | Path) -> Log:
     Raises:
         LogError: the file cannot be read, or is not such a log; the message names the line, and the column.
     """
-    source = str(path)
-    table = _Table(source)
+    return _log_in(CsvTable(str(path)))
+
+
+def read_parquet(path: str | Path) -> Log:
+    """The log in a Parquet file, of the same columns. Needs the extra `parquet`.
+
+    Raises:
+        LogError: the file cannot be read, or is not such a log; the message names the row, and the column.
+    """
+    return _log_in(ParquetTable(str(path)))
+
+
+def _log_in(table: Table) -> Log:
     axes = [axis for axis in "xyz" if axis in "xy" or axis in table.header]
     velocities = [f"v{axis}" for axis in "xyz" if f"v{axis}" in table.header]
     for name in ["t", "robot", *axes, *(f"v{axis}" for axis in axes if velocities)]:
-        table.require(name)
+        require_column(table, name)
     if "z" not in axes and "vz" in velocities:
-        raise LogError(f"{source} line 1: column 'vz' without 'z'")
+        raise table.header_error("column 'vz' without 'z'")
 
     t = table.numbers("t")
     steps = np.diff(t)
@@ -156,7 +199,7 @@ def read_csv(path: str | Path) -> Log:
     seen = np.zeros((time[-1] + 1, len(bodies)), dtype=bool)
     seen[time, body] = True
     return Log(
-        source=source,
+        source=table.source,
         bodies=bodies,
         t=t[np.concatenate([[True], steps > 0])],
         x=by_time_and_body(axes),
@@ -167,7 +210,7 @@ def read_csv(path: str | Path) -> Log:
     )
 
 
-def _radius(table: _Table, names: list[str], body: np.ndarray) -> Float[np.ndarray, "bodies"]:
+def _radius(table: Table, names: list[str], body: np.ndarray) -> Float[np.ndarray, "bodies"]:
     values = table.numbers("radius")
     if (values < 0).any():
         i = int(np.argmax(values < 0))
@@ -178,70 +221,3 @@ def _radius(table: _Table, names: list[str], body: np.ndarray) -> Float[np.ndarr
         i = int(np.argmax(changed))
         raise table.error(i, f"the radius of robot {names[i]!r} changes from {radius[body[i]]} to {values[i]}")
     return radius
-
-
-class _Table:
-    """The cells of a CSV file, as text, with the line of the file that each row stands on."""
-
-    def __init__(self, source: str):
-        self.source = source
-        self.lines: list[int] = []
-        records: list[list[str]] = []
-        try:
-            with open(source, encoding="utf-8-sig", newline="") as file:
-                reader = csv.reader(file, strict=True)
-                for record in reader:
-                    if len(record) > 1 or "".join(record).strip():  # not a blank line
-                        records.append(record)
-                        self.lines.append(reader.line_num)
-        except OSError as error:
-            raise LogError(f"{source}: cannot be read: {error.strerror or error}") from error
-        except UnicodeDecodeError as error:
-            raise LogError(f"{source}: not text in UTF-8") from error
-        except csv.Error as error:
-            raise LogError(f"{source} line {reader.line_num}: not valid CSV: {error}") from error
-        if not records:
-            raise LogError(f"{source}: the file is empty")
-        self.header = [name.strip() for name in records.pop(0)]
-        self.rows = records
-        header_line = self.lines.pop(0)
-        if not records:
-            raise LogError(f"{source} line {header_line}: no rows after the header")
-        for i, row in enumerate(records):
-            if len(row) != len(self.header):
-                raise self.error(i, f"expected {len(self.header)} cells as in the header, got {len(row)}")
-
-    def error(self, row: int, message: str) -> LogError:
-        return LogError(f"{self.source} line {self.lines[row]}: {message}")
-
-    def require(self, name: str) -> None:
-        count = self.header.count(name)
-        if count != 1:
-            problem = f"{count} columns are called" if count else "no column"
-            raise LogError(f"{self.source} line 1: {problem} {name!r}, the header has {reprlib.repr(self.header)}")
-
-    def names(self, column: str) -> list[str]:
-        index = self.header.index(column)
-        names = [row[index].strip() for row in self.rows]
-        if "" in names:
-            raise self.error(names.index(""), f"column {column!r} is empty")
-        return names
-
-    def numbers(self, column: str) -> Float[np.ndarray, "rows"]:
-        index = self.header.index(column)
-        cells = [row[index] for row in self.rows]
-        try:
-            values = np.fromiter(map(float, cells), dtype=np.float64, count=len(cells))
-        except ValueError:
-            values = np.array([math.nan])
-        if np.isfinite(values).all():
-            return values
-        i = next(i for i, cell in enumerate(cells) if not _is_finite(cell))
-        raise self.error(i, f"column {column!r}: expected a finite number, got {reprlib.repr(cells[i])}")
-
-
-def _is_finite(cell: str) -> bool:
-    try:
-        return math.isfinite(float(cell))
-    except ValueError:
-        return False

@@ -12,14 +12,13 @@ import torch
 
 from torchfsid.config import ObserveConfig
 from torchfsid.documents import dump
-from torchfsid.errors import ConfigError
-from torchfsid.feasible_set import FeasibleSet
 from torchfsid.figures import draw_observation
 from torchfsid.hybrid import HybridObserver
 from torchfsid.kkt import CASES
 from torchfsid.logs import Log
 from torchfsid.observer import SetMembershipObserver, Status
-from torchfsid.results import STATUS_NAMES, ResultsWriter
+from torchfsid.results import STATUS_NAMES, ResultsWriter, write_json
+from torchfsid.scene import AUTO_FACTOR, Scene
 from torchfsid.ukf import ParameterUkf
 
 
@@ -42,55 +41,48 @@ class Verdict:
 
 @dataclass
 class Observation:
-    """A log and the declared model, checked against each other and ready to run.
+    """A log and the declared model, ready to run.
+
+    Attributes:
+        config: with the velocity bound that was found, if it said `auto`.
+        smallest_bounds: for each robot the smallest velocity bound that explains its motion [m/s], if it said `auto`.
 
     Raises:
-        ConfigError: the model needs what the log does not have (a body, velocities, radii, planar positions).
+        ConfigError: see `Scene`.
     """
 
     config: ObserveConfig
     log: Log
+    scene: Scene = field(init=False)
     robots: list[str] = field(init=False)
     sets: SetMembershipObserver = field(init=False)
     hybrid: HybridObserver = field(init=False)
+    smallest_bounds: dict[str, float] | None = field(init=False, default=None)
     _cases: dict[str, Counter[str]] = field(init=False)
 
     def __post_init__(self) -> None:
-        config = self.config
-        if self.log.x.shape[-1] != 2:
-            raise ConfigError("task: planar controllers only, but the log has a column z")
-        if config.velocity == "logged" and self.log.u is None:
-            raise ConfigError("velocity: 'logged', but the log has no columns vx, vy (use 'differentiated')")
-        margins = [b.margin for b in config.barriers if b.kind == "avoidance" and b.margin is not None]
-        if margins and self.log.radius is None:
-            raise ConfigError("barriers: a margin needs the radii, but the log has no column radius")
-        if margins and self.log.radius is not None and min(margins) + sorted(self.log.radius)[0] <= 0:
-            raise ConfigError("barriers: a margin of 0 needs positive radii")
-        if len(self.log.bodies) > 1 and not (self.log.seen.sum(axis=1) > 1).any():
-            raise ConfigError(f"{self.log.source}: no two bodies share a time, so none would ever see another")
-        if config.velocity == "differentiated":
-            self.log = self.log.differentiated()
-        self.robots = config.robots(self.log.bodies)
+        self.scene = scene = Scene(self.config, self.log)
+        if self.config.noise.velocity == "auto":
+            self.smallest_bounds = scene.smallest_bounds()
+            self.config = self.config.with_velocity_bound(AUTO_FACTOR * max(self.smallest_bounds.values()))
+        config, self.log, self.robots = self.config, scene.log, scene.robots
         self._cases = {robot: Counter() for robot in self.robots}
-
-        task = config.task.build(self.log.bodies)
-        barriers = [barrier.build() for barrier in config.barriers]
-        lower, upper = (
-            torch.tensor(bound, dtype=torch.float64).expand(len(self.robots), -1)
-            for bound in (config.prior.lower, config.prior.upper)
-        )
         self.sets = SetMembershipObserver(
-            task,
-            barriers,
-            FeasibleSet.from_box(lower, upper),
+            scene.task,
+            scene.barriers,
+            scene.prior,
             kind=config.set,
             noise=config.noise.build(),
             active_tolerance=config.active_tolerance,
             on_inconsistent=config.on_inconsistent,
         )
+        lower, upper = (
+            torch.tensor(bound, dtype=torch.float64).expand(len(self.robots), -1)
+            for bound in (config.prior.lower, config.prior.upper)
+        )
         ukf = ParameterUkf(
-            task,
-            barriers,
+            scene.task,
+            scene.barriers,
             mean=(lower + upper) / 2,
             spread=(upper - lower) / math.sqrt(12) if config.ukf.prior_std is None else config.ukf.prior_std,
             position_noise=config.ukf.position_noise,
@@ -102,10 +94,12 @@ class Observation:
 
     def run(self, out: Path) -> Iterator[float]:
         """Observe the whole log into the folder `out`, yielding the time of each sample done; the figure comes last."""
-        measurements = self.log.measurements(self.robots, self.config.neighbour_velocities, self.config.required)
         with ResultsWriter(out, self.robots, self.sets) as results:
             (out / "config.yaml").write_text(dump(self.config), encoding="utf-8")
-            for measurement in measurements:
+            if self.smallest_bounds is not None:
+                found = {"smallest": self.smallest_bounds, "factor": AUTO_FACTOR, "used": self.config.noise.velocity}
+                write_json(out / "velocity_bound.json", found)
+            for measurement in self.scene.measurements():
                 estimate = self.hybrid.update(measurement)
                 results.write(measurement, estimate)
                 informative = estimate.set_estimate.informative.tolist()

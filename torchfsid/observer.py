@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -30,7 +30,7 @@ from torchfsid.critical_region import critical_region
 from torchfsid.errors import InconsistentError, InputError
 from torchfsid.feasible_set import FeasibleSet
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.inverse_optimal import NoiseBound, Uncertainty, inverse_optimal_set
+from torchfsid.inverse_optimal import NoiseBound, Uncertainty, inverse_optimal_set, per_row
 from torchfsid.kkt import KktSolution, solve_kkt
 from torchfsid.measurement import ErrorBounds, Measurement
 from torchfsid.tasks import Task
@@ -86,6 +86,28 @@ class SetEstimate:
         return self.feasible_set.centroid()
 
 
+class Reading(NamedTuple):
+    """What one measurement says by itself.
+
+    Attributes:
+        omega: half-spaces of theta; padding where the sample is not used.
+        informative: the sample is used. alarmed: it is not, because a hard row is violated beyond its bound.
+        safe_controls, C, d: the model at this measurement, zeros where it could not be evaluated.
+        slack: of the measured control to every row [m/s]. excess: its violation beyond the bound, positive if there is
+            any [m/s]. hard: the rows that no controller may violate.
+    """
+
+    omega: Halfspaces
+    informative: Bool[Tensor, "B"]
+    alarmed: Bool[Tensor, "B"]
+    safe_controls: Halfspaces
+    C: Float[Tensor, "B n p"]
+    d: Float[Tensor, "B n"]
+    slack: Float[Tensor, "B m"]
+    excess: Float[Tensor, "B m"]
+    hard: Bool[Tensor, "m"]
+
+
 @dataclass
 class SetMembershipObserver:
     """Theta(t) for a batch of robots that share a task and barriers.
@@ -135,6 +157,25 @@ class SetMembershipObserver:
         """Take in one measurement of all robots.
 
         Raises:
+            InputError: see `read`.
+            InconsistentError: an intersection is empty, and `on_inconsistent` is `raise`.
+        """
+        reading, t = self.read(measurement), measurement.t
+        narrowed = self.feasible_set.intersect(reading.omega, time=t)
+        contradicted = narrowed.is_empty
+        self._report(t, reading.alarmed, reading.slack, narrowed)
+        instead = self.feasible_set if self.on_inconsistent == "hold" else self.prior
+        self.feasible_set = narrowed.where(~contradicted, instead)
+        self.skipped = self.skipped + (~reading.informative).long()
+        assert measurement.u is not None
+        active = active_set(reading.safe_controls, measurement.u, self.active_tolerance)
+        kkt = solve_kkt(reading.safe_controls, active, reading.C, reading.d)
+        return SetEstimate(t, self.feasible_set, kkt, reading.informative & ~contradicted, self.status)
+
+    def read(self, measurement: Measurement) -> Reading:
+        """What a measurement of all robots says about theta; nothing is changed.
+
+        Raises:
             InputError: the measurement has no velocities, or they are not finite where the robot was observed.
         """
         u, t = measurement.u, measurement.t
@@ -150,19 +191,19 @@ class SetMembershipObserver:
         slack = safe_controls.slack(u)
         uncertainty = self._uncertainty(measurement)
         hard = torch.cat([torch.full((part.rows,), not b.soft) for part, b in zip(parts, self.barriers, strict=True)])
-        bound = self.active_tolerance if self.noise is None else self.noise.slack
+        bound = slack.new_tensor(self.active_tolerance) if self.noise is None else per_row(self.noise.slack, slack)
         if uncertainty is not None:
             bound = bound + uncertainty.slack
-        broken = (slack < -bound) & hard
+        excess = -slack - bound - safe_controls.round_off(u)
         failed = (u == 0).all(-1) & (slack < 0).any(-1)
         measured = evaluated.all(-1) & wish_known & ~failed
         if measurement.observed is not None:
             measured = measured & measurement.observed
-        alarmed = measured & broken.any(-1)
+        alarmed = measured & ((excess > 0) & hard).any(-1)
         informative = measured & ~alarmed
 
-        active = active_set(safe_controls, u, self.active_tolerance)
         if self.kind == "critical_region":
+            active = active_set(safe_controls, u, self.active_tolerance)
             omega = critical_region(safe_controls, active, C, d)
         else:
             assert self.noise is not None
@@ -177,14 +218,7 @@ class SetMembershipObserver:
                 possible=None if self.task.saturation is None else self._possible(C, d),
             )
         omega = omega.where(informative.unsqueeze(-1))
-        narrowed = self.feasible_set.intersect(omega, time=t)
-        contradicted = narrowed.is_empty
-        self._report(t, alarmed, slack, narrowed)
-        instead = self.feasible_set if self.on_inconsistent == "hold" else self.prior
-        self.feasible_set = narrowed.where(~contradicted, instead)
-        self.skipped = self.skipped + (~informative).long()
-        kkt = solve_kkt(safe_controls, active, C, d)
-        return SetEstimate(t, self.feasible_set, kkt, informative & ~contradicted, self.status)
+        return Reading(omega, informative, alarmed, safe_controls, C, d, slack, excess, hard)
 
     def _report(self, t: float, alarmed: Tensor, slack: Tensor, narrowed: FeasibleSet) -> None:
         """Record what went wrong for the first time, and raise the statuses."""

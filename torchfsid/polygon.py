@@ -18,8 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-ROUND_OFF = 8 * torch.finfo(torch.float64).eps
-"""A vertex this close to a line, relative to the sizes of the numbers involved, lies on it."""
+from torchfsid.halfspaces import ROUND_OFF
 
 PRIOR = -1
 """`source` of the edges that a set began with."""

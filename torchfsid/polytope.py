@@ -30,13 +30,14 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
-from scipy.optimize import linprog, nnls
+from scipy.optimize import nnls
 from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from torchfsid.clipping import Outcome
 from torchfsid.errors import SolverError
-from torchfsid.polygon import PRIOR, ROUND_OFF
+from torchfsid.halfspaces import ROUND_OFF
+from torchfsid.polygon import PRIOR
 
 OPEN = 1e-9
 """The normals of a closed surface times their areas add up to zero: to this share of its area."""
@@ -148,10 +149,10 @@ class Polytope:
         return (direction.detach() @ self.vertices.transpose(1, 2)).amax(-1)
 
     def chebyshev(self) -> tuple[Float[Tensor, "B p"], Float[Tensor, "B"]]:
-        """Centre and radius of a largest inscribed ball: max r s.t. A_f.z + |A_f| r <= b_f, by HiGHS.
+        """Centre and radius of a largest inscribed ball: max r s.t. A_f.z + |A_f| r <= b_f.
 
         The radius is the distance from the returned centre to the nearest facet. Where the centre is not unique, an end
-        of the set of centres is returned. Raises `SolverError` if HiGHS finds no solution.
+        of the set of centres is returned.
         """
         centres, radii = [cell.ball[0] for cell in self._cells], [cell.ball[1] for cell in self._cells]
         return self._tensor(centres, self.dim), self._tensor(radii)
@@ -267,22 +268,35 @@ class _Cell:
 
     @cached_property
     def ball(self) -> tuple[Reals, float]:
-        """Centre and radius of a largest inscribed ball."""
+        """Centre and radius of a largest inscribed ball, by the dual simplex method.
+
+        From a simplex far around the set, exchange one of p + 1 rows for the one that is violated most, until none is.
+        """
         centre, axes, scale = self.frame
-        scale = np.where(scale > 0, scale, 1.0)
-        rows, lengths = self.A @ (axes.T * scale), _lengths(self.A)
+        if not scale.all():
+            return self.measure[1], 0.0
+        p, lengths = len(centre), _lengths(self.A)
+        rows = self.A @ (axes.T * scale)
         norms = _lengths(rows)
-        result = linprog(
-            np.append(np.zeros(len(centre)), -1.0),
-            A_ub=np.column_stack([rows, lengths * scale.min()]) / norms[:, None],
-            b_ub=(self.b - self.A @ centre) / norms,
-            bounds=(None, None),
-            method="highs-ds",
-            options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
-        )
-        if result.status != 0:
-            raise SolverError(f"HiGHS found no inscribed ball of a set: {result.message}")
-        middle = centre + (result.x[:-1] * scale) @ axes
+        rows = np.column_stack([rows, lengths * scale.min()]) / norms[:, None]
+        simplex = np.column_stack([np.vstack([np.eye(p), -np.ones(p)]), np.ones(p + 1)])
+        far = 2.0 * p * len(self.vertices)  # no vertex is further from the centre than sqrt(V)
+        right = np.append((self.b - self.A @ centre) / norms, np.full(p + 1, far))
+        rows, tolerance = np.vstack([rows, simplex]), _round_off(self.A, self.b, self.vertices) / norms
+        basis, best = np.arange(len(norms), len(rows)), np.zeros(p + 1)
+        for _ in range(50 * p):  # 2 p are usual; should round-off send it round in circles, the centre will do
+            inverse = np.linalg.inv(rows[basis])
+            solution = inverse @ right[basis]
+            violation = (rows @ solution - right)[: len(norms)] - tolerance  # rows of the simplex never come back
+            entering = violation.argmax()
+            if violation[entering] <= 0:
+                best = solution
+                break
+            share = rows[entering] @ inverse
+            able = share > ROUND_OFF
+            ratio = np.where(able, inverse[-1].clip(0) / np.where(able, share, 1.0), inf)
+            basis[np.where(ratio <= ratio.min() + ROUND_OFF, share, 0.0).argmax()] = entering
+        middle = centre + (best[:p] * scale) @ axes
         return middle, max(0.0, float(((self.b - self.A @ middle) / lengths).min()))
 
 

@@ -1,0 +1,106 @@
+"""Positions and velocities known up to bounds: whole closed loops, errors at the bound, the truth never lost."""
+
+import itertools
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchfsid.barriers import Arena, Barrier, ClassK, CollisionAvoidance, SpeedPolygon
+from torchfsid.controller import CbfQpController
+from torchfsid.feasible_set import FeasibleSet
+from torchfsid.inverse_optimal import NoiseBound
+from torchfsid.measurement import ErrorBounds, Measurement
+from torchfsid.observer import SetMembershipObserver, Status
+from torchfsid.simulation import simulate
+from torchfsid.tasks import GoalTask, OrbitTask, PatrolTask, Saturation, Task, UnknownGainGoalTask, VelocityTask
+
+SATURATIONS = [None, Saturation("norm", (0.5, 0.5), dead_speed=0.03), Saturation("box", (0.5, 0.4))]
+BARRIERS = [
+    [CollisionAvoidance(ClassK(1.0), safety_distance=0.3)],
+    [CollisionAvoidance(ClassK(2.0, 3), safety_distance=0.3, neighbour_velocity="current"), SpeedPolygon(8, 0.45)],
+    [
+        CollisionAvoidance(ClassK(1.0), safety_distance=0.3, distance="euclidean", neighbour_velocity="previous"),
+        Arena((-2.0, -2.0), (2.0, 2.0), ClassK(1.0)),
+    ],
+]
+
+
+@pytest.mark.parametrize("saturation", SATURATIONS, ids=["linear", "norm", "box"])
+@pytest.mark.parametrize("barriers", BARRIERS, ids=["squared", "joint", "euclidean"])
+def test_truth_inside_for_a_whole_run(saturation: Saturation | None, barriers: list[Barrier]) -> None:
+    seed = 10 * SATURATIONS.index(saturation) + BARRIERS.index(barriers)
+    generator = torch.Generator().manual_seed(seed)
+    task, n = GoalTask(0.8, saturation=saturation), 4
+    turn = 2 * math.pi * torch.arange(n, dtype=torch.float64) / n
+    start = 1.4 * torch.stack([turn.cos(), turn.sin()], dim=-1)
+    goals = -start + 0.2 * torch.randn(n, 2, generator=generator, dtype=torch.float64)
+    run = simulate(CbfQpController(task, barriers), goals, start, dt=0.1, steps=25)
+    for position, velocity in [(3e-3, 1e-3), (3e-2, 3e-2)]:
+
+        def error(bound: float, at_the_bound: bool) -> torch.Tensor:
+            angle = 2 * math.pi * torch.rand(n, generator=generator, dtype=torch.float64)
+            length = 1.0 if at_the_bound else torch.rand(n, 1, generator=generator, dtype=torch.float64)
+            return bound * length * torch.stack([angle.cos(), angle.sin()], dim=-1)
+
+        noise = NoiseBound(velocity, position=position, neighbour_velocity=velocity)
+        prior = FeasibleSet.from_box(torch.full((n, 2), -4.0), torch.full((n, 2), 4.0))
+        watching = SetMembershipObserver(task, barriers, prior, noise=noise)
+        previous_u = torch.zeros(n, 2, dtype=torch.float64)
+        for k in range(len(run.t)):
+            x, u = run.x[k] + error(position, k % 2 == 0), run.u[k] + error(velocity, k % 3 > 0)
+            seen = Measurement.of_team(float(run.t[k]), x, u, previous_u=previous_u)
+            estimate = watching.update(replace(seen, observed=run.feasible[k]))
+            assert estimate.feasible_set.contains(goals).all(), (k, position, velocity)
+            previous_u = u
+        assert (watching.status == Status.OK).all()
+
+
+def test_row_errors_hold_at_the_corners_of_the_errors() -> None:
+    """Move the robot and a body by their bounds in 16 x 16 directions: no direction or slack changes by more than told."""
+    generator = torch.Generator().manual_seed(4)
+    compass = [(math.cos(k * math.pi / 8), math.sin(k * math.pi / 8)) for k in range(16)]
+    moves = torch.tensor(list(itertools.product(compass, compass)), dtype=torch.float64)
+    for distance, velocity, power in itertools.product(["squared", "euclidean"], ["none", "current"], [1, 2, 3]):
+        barrier = CollisionAvoidance(
+            ClassK(1.5, power), safety_distance=0.4, distance=distance, neighbour_velocity=velocity
+        )
+        for e_robot, e_body in [(0.01, 0.02), (0.1, 0.0), (0.2, 0.15)]:
+            count = len(moves)
+            x = torch.randn(1, 2, generator=generator, dtype=torch.float64).expand(count, 2)
+            body = x[:, None] + 0.3 + torch.rand(1, 1, 2, generator=generator, dtype=torch.float64)
+            u, u_body = torch.randn(2, 1, 2, generator=generator, dtype=torch.float64).expand(2, count, 2)
+            there = torch.ones(count, 1, dtype=torch.bool)
+            seen = Measurement(0.0, x, u, body, there, body_velocities=u_body.unsqueeze(1))
+            exactly = torch.zeros(count, 1, dtype=torch.float64)
+            told = barrier.errors(seen, ErrorBounds(exactly[:, 0] + e_robot, exactly + e_body, exactly))
+            true = replace(seen, x=x + e_robot * moves[:, 0], bodies=body + e_body * moves[:, 1:])
+            measured, rows = barrier(seen).normalised(), barrier(true).normalised()
+            cosine = (rows.A * measured.A).sum(-1).clamp(-1, 1)
+            assert (cosine.arccos() <= told.angle + 1e-7).all()
+            # Only one side matters: an active row must not be measured as far from active.
+            assert (measured.slack(u) - rows.slack(u) <= told.slack + 1e-9).all()
+
+
+@pytest.mark.parametrize(
+    "task",
+    [GoalTask(0.7), UnknownGainGoalTask(), VelocityTask(), OrbitTask(-0.6), PatrolTask(0.7, 0.5, harmonics=2)],
+    ids=lambda task: type(task).__name__,
+)
+def test_drift_bounds_what_position_errors_do_to_the_nominal_control(task: Task) -> None:
+    generator = torch.Generator().manual_seed(5)
+    p = len(task.parameter_names)
+    x, move = torch.randn(2, 500, 2, generator=generator, dtype=torch.float64)
+    theta = torch.randn(500, p, generator=generator, dtype=torch.float64)
+    nobody = torch.zeros(500, 0, 2, dtype=torch.float64)
+
+    def nominal(at: torch.Tensor) -> torch.Tensor:
+        C, d = task(Measurement(0.3, at, None, nobody, nobody[..., 0].bool()))
+        return (C @ theta.unsqueeze(-1)).squeeze(-1) + d
+
+    bound = 0.05
+    nothing = nobody[..., 0]
+    drift = task.drift(ErrorBounds(torch.full((500,), bound, dtype=torch.float64), nothing, nothing), theta.abs())
+    moved = nominal(x + bound * move / move.norm(dim=-1, keepdim=True)) - nominal(x)
+    assert (moved.norm(dim=-1) <= drift + 1e-12).all()

@@ -1,0 +1,121 @@
+"""A log and the declared model, checked against each other: what every command needs before it can begin."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import torch
+
+from torchfsid.barriers import Barrier
+from torchfsid.config import ObserveConfig
+from torchfsid.consistency import Consistency
+from torchfsid.errors import ConfigError
+from torchfsid.feasible_set import FeasibleSet
+from torchfsid.logs import Log
+from torchfsid.measurement import Measurement
+from torchfsid.tasks import Task
+
+AUTO_FACTOR = 2.0
+"""`noise.velocity: auto` takes the smallest bound that explains the log this many times: the worst error of a log is
+not the worst there is, and part of an error may look like another parameter."""
+
+
+@dataclass
+class Scene:
+    """A log and the declared model.
+
+    Attributes:
+        log: with differences of its positions for velocities, if the configuration says so.
+        robots: the bodies to infer. task, barriers: the model. prior: the robots' prior sets.
+
+    Raises:
+        ConfigError: the model needs what the log does not have (a body, velocities, radii, planar positions).
+    """
+
+    config: ObserveConfig
+    log: Log
+    robots: list[str] = field(init=False)
+    task: Task = field(init=False)
+    barriers: list[Barrier] = field(init=False)
+    prior: FeasibleSet = field(init=False)
+
+    def __post_init__(self) -> None:
+        config = self.config
+        if self.log.x.shape[-1] != 2:
+            raise ConfigError("task: planar controllers only, but the log has a column z")
+        if config.velocity == "logged" and self.log.u is None:
+            raise ConfigError("velocity: 'logged', but the log has no velocities vx, vy (use 'differentiated')")
+        margins = [b.margin for b in config.barriers if b.kind == "avoidance" and b.margin is not None]
+        if margins and self.log.radius is None:
+            raise ConfigError("barriers: a margin needs the radii, but the log has none (column radius, bag.radius)")
+        if margins and self.log.radius is not None and min(margins) + sorted(self.log.radius)[0] <= 0:
+            raise ConfigError("barriers: a margin of 0 needs positive radii")
+        if len(self.log.bodies) > 1 and not (self.log.seen.sum(axis=1) > 1).any():
+            raise ConfigError(f"{self.log.source}: no two bodies share a time, so none would ever see another")
+        if config.velocity == "differentiated":
+            self.log = self.log.differentiated()
+        self.robots = config.robots(self.log.bodies)
+        self.task = config.task.build(self.log.bodies)
+        self.barriers = [barrier.build() for barrier in config.barriers]
+        lower, upper = (
+            torch.tensor(bound, dtype=torch.float64).expand(len(self.robots), -1)
+            for bound in (config.prior.lower, config.prior.upper)
+        )
+        self.prior = FeasibleSet.from_box(lower, upper)
+
+    @property
+    def row_labels(self) -> list[str]:
+        """A name for each row of the model."""
+        return [label for barrier in self.barriers for label in barrier.labels(self.log.bodies)]
+
+    def measurements(self) -> Iterator[Measurement]:
+        """The samples of the robots."""
+        return self.log.measurements(self.robots, self.config.neighbour_velocities, self.config.required)
+
+    def consistency(self) -> Consistency:
+        """What the log says about the errors, under the model and all declared bounds but that on the velocity."""
+        noise = self.config.noise
+        return Consistency(
+            list(self.measurements()),
+            self.task,
+            self.barriers,
+            self.prior,
+            noise.slack,
+            noise.position,
+            noise.neighbour_velocity,
+        )
+
+    def shifted(self, samples: int) -> Scene:
+        """The scene in which the velocities of a sample are those logged so many samples later."""
+        log, times = self.log, len(self.log.t)
+        kept = slice(max(0, -samples), times - max(0, samples))
+        moved = slice(max(0, samples), times + min(0, samples))
+        shifted = replace(
+            log,
+            t=log.t[kept],
+            x=log.x[kept],
+            u=None if log.u is None else log.u[moved],
+            seen=log.seen[kept],
+            velocity_known=log.velocity_known[moved] & log.seen[kept],
+            position_error=None if log.position_error is None else log.position_error[kept],
+            velocity_error=None if log.velocity_error is None else log.velocity_error[moved],
+            lost=None if log.lost is None else log.lost[kept],
+        )
+        return replace(self, config=self.config.model_copy(update={"velocity": "logged"}), log=shifted)
+
+    def smallest_bounds(self) -> dict[str, float]:
+        """For each robot the smallest velocity bound with which the model explains its motion [m/s].
+
+        Raises:
+            ConfigError: no bound up to the largest speed in the log does, for some robot.
+        """
+        consistency = self.consistency()
+        found = dict(zip(self.robots, consistency.smallest_bounds(consistency.fastest).tolist(), strict=True))
+        for robot, bound in found.items():
+            if bound == float("inf"):
+                raise ConfigError(
+                    f"noise.velocity: auto finds no bound that explains robot {robot!r}, up to {consistency.fastest:.4g} "
+                    "m/s, the largest speed in the log: the model is wrong (see `torchfsid check`)"
+                )
+        return found

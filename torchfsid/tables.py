@@ -1,0 +1,172 @@
+"""Tables of a log: rows of named columns, from CSV or Parquet, whose every mistake is named by row and column."""
+
+from __future__ import annotations
+
+import csv
+import math
+import reprlib
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+from torchfsid.errors import LogError, one_line
+
+
+@runtime_checkable
+class Table(Protocol):
+    """Rows of named columns."""
+
+    source: str
+    header: list[str]
+
+    def error(self, row: int, message: str) -> LogError:
+        """A mistake in the row of this index."""
+        ...
+
+    def header_error(self, message: str) -> LogError:
+        """A mistake in the names of the columns."""
+        ...
+
+    def names(self, column: str) -> list[str]:
+        """The column as names, none of them empty."""
+        ...
+
+    def numbers(self, column: str) -> Float[np.ndarray, "rows"]:
+        """The column as finite numbers."""
+        ...
+
+
+def require_column(table: Table, name: str) -> None:
+    """Raises `LogError` if the table has not exactly one column of that name."""
+    count = table.header.count(name)
+    if count != 1:
+        problem = f"{count} columns are called" if count else "no column"
+        raise table.header_error(f"{problem} {name!r}, the header has {reprlib.repr(table.header)}")
+
+
+class CsvTable:
+    """The cells of a CSV file, as text, with the line of the file that each row stands on."""
+
+    def __init__(self, source: str):
+        self.source = source
+        self.lines: list[int] = []
+        records: list[list[str]] = []
+        try:
+            with open(source, encoding="utf-8-sig", newline="") as file:
+                reader = csv.reader(file, strict=True)
+                for record in reader:
+                    if len(record) > 1 or "".join(record).strip():  # not a blank line
+                        records.append(record)
+                        self.lines.append(reader.line_num)
+        except OSError as error:
+            raise LogError(f"{source}: cannot be read: {error.strerror or error}") from error
+        except UnicodeDecodeError as error:
+            raise LogError(f"{source}: not text in UTF-8") from error
+        except csv.Error as error:
+            raise LogError(f"{source} line {reader.line_num}: not valid CSV: {error}") from error
+        if not records:
+            raise LogError(f"{source}: the file is empty")
+        self.header = [name.strip() for name in records.pop(0)]
+        self.rows = records
+        header_line = self.lines.pop(0)
+        if not records:
+            raise LogError(f"{source} line {header_line}: no rows after the header")
+        for i, row in enumerate(records):
+            if len(row) != len(self.header):
+                raise self.error(i, f"expected {len(self.header)} cells as in the header, got {len(row)}")
+
+    def error(self, row: int, message: str) -> LogError:
+        return LogError(f"{self.source} line {self.lines[row]}: {message}")
+
+    def header_error(self, message: str) -> LogError:
+        return LogError(f"{self.source} line 1: {message}")
+
+    def names(self, column: str) -> list[str]:
+        index = self.header.index(column)
+        names = [row[index].strip() for row in self.rows]
+        if "" in names:
+            raise self.error(names.index(""), f"column {column!r} is empty")
+        return names
+
+    def numbers(self, column: str) -> Float[np.ndarray, "rows"]:
+        index = self.header.index(column)
+        cells = [row[index] for row in self.rows]
+        try:
+            values = np.fromiter(map(float, cells), dtype=np.float64, count=len(cells))
+        except ValueError:
+            values = np.array([math.nan])
+        if np.isfinite(values).all():
+            return values
+        i = next(i for i, cell in enumerate(cells) if not _is_finite(cell))
+        raise self.error(i, f"column {column!r}: expected a finite number, got {reprlib.repr(cells[i])}")
+
+
+def _is_finite(cell: str) -> bool:
+    try:
+        return math.isfinite(float(cell))
+    except ValueError:
+        return False
+
+
+class ParquetTable:
+    """The columns of a Parquet file, read when they are asked for; rows are counted from 1."""
+
+    def __init__(self, source: str):
+        try:
+            from pyarrow import BufferReader
+            from pyarrow.parquet import ParquetFile
+        except ImportError as error:
+            raise LogError(f"{source}: Parquet needs an extra: pip install 'torchfsid[parquet]'") from error
+        self.source = source
+        try:
+            content = Path(source).read_bytes()
+        except OSError as error:
+            raise LogError(f"{source}: cannot be read: {error.strerror or error}") from error
+        try:
+            self.file = ParquetFile(BufferReader(content))
+            self.header: list[str] = self.file.schema_arrow.names
+        except Exception as error:  # of many kinds, whatever wrong bytes led the parser to
+            raise LogError(f"{source}: not valid Parquet: {one_line(error)}") from error
+        if self.file.metadata.num_rows == 0:
+            raise self.header_error("no rows")
+
+    def error(self, row: int, message: str) -> LogError:
+        return LogError(f"{self.source} row {row + 1}: {message}")
+
+    def header_error(self, message: str) -> LogError:
+        return LogError(f"{self.source}: {message}")
+
+    def names(self, column: str) -> list[str]:
+        from pyarrow import types
+
+        cells = self._column(column)
+        if not (types.is_string(cells.type) or types.is_large_string(cells.type) or types.is_integer(cells.type)):
+            raise self.header_error(f"column {column!r}: expected text or whole numbers, it holds {cells.type}")
+        names = ["" if cell is None else str(cell).strip() for cell in cells.to_pylist()]
+        if "" in names:
+            raise self.error(names.index(""), f"column {column!r} is empty")
+        return names
+
+    def numbers(self, column: str) -> Float[np.ndarray, "rows"]:
+        from pyarrow import float64, types
+
+        cells = self._column(column)
+        if not (types.is_integer(cells.type) or types.is_floating(cells.type) or types.is_decimal(cells.type)):
+            raise self.header_error(f"column {column!r}: expected numbers, it holds {cells.type}")
+        values = cells.cast(float64(), safe=False).to_numpy(zero_copy_only=False).astype(np.float64)
+        if not np.isfinite(values).all():
+            i = int(np.argmin(np.isfinite(values)))
+            raise self.error(i, f"column {column!r}: expected a finite number, got {cells[i].as_py()!r}")
+        return values
+
+    def _column(self, column: str) -> Any:
+        """One Arrow array; of a column of categories, their values."""
+        from pyarrow import types
+
+        try:
+            cells = self.file.read(columns=[column]).column(column).combine_chunks()
+            return cells.dictionary_decode() if types.is_dictionary(cells.type) else cells
+        except Exception as error:  # of many kinds, as above: the pages are parsed only now
+            raise LogError(f"{self.source}: not valid Parquet: {one_line(error)}") from error
