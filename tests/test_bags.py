@@ -189,7 +189,7 @@ def test_wrong_mappings(csv_log, tmp_path):
     assert "no topic is called '/robot7/odom'; there are ['/robot0/odom', '/robot1/odom', '/tf']" in refusal(
         path, section(topics={"/robot7/odom": "ann"})
     )
-    assert "topic '/tf' is of type tf2_msgs/msg/TFMessage, not nav_msgs/msg/Odometry or geometry" in refusal(
+    assert "topic '/tf' is of type 'tf2_msgs/msg/TFMessage', not nav_msgs/msg/Odometry or geometry" in refusal(
         path, section(topics={"/tf": "ann"})
     )
     assert "frame 'a': expected at least 2 messages with different stamps, got 1" in refusal(
@@ -295,11 +295,13 @@ def test_damaged_bags_are_one_line(bags, csv_log, tmp_path_factory, data):
         (folder / "metadata.yaml").write_bytes(content[:first] + damage + content[second:])
     else:
         path.write_bytes(content[:first] + damage + content[second:])
+    message, log = "", None
     try:
         log = read_log(path, section(**section_of(csv_log)))
     except FsidError as error:
-        assert str(error).isprintable()
-    else:
+        message = str(error)
+    assert message.isprintable()
+    if log is not None:
         assert np.isfinite(log.x).all()
         assert (np.diff(log.t) > 0).all()
 

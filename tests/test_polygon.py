@@ -153,7 +153,7 @@ def test_rows_that_touch_within_round_off_change_nothing():
     before = boxes(128)
     normals = tensor(unit(rng.uniform(0, 2 * np.pi, (128, 100))))
     support = before.support(normals)
-    depth = round_off(normals, support, before.vertices) * (1 + 0.005 * tensor(rng.uniform(-1, 1, (128, 100))))
+    depth = round_off(normals, support, before.reach) * (1 + 0.005 * tensor(rng.uniform(-1, 1, (128, 100))))
     after = cut(before, normals, support - depth).body
     assert torch.allclose(after.volume(), before.volume(), rtol=1e-12)
     assert torch.allclose(after.chebyshev()[1], before.chebyshev()[1], rtol=1e-12)

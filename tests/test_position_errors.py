@@ -17,7 +17,7 @@ from torchfsid.simulation import simulate
 from torchfsid.tasks import GoalTask, OrbitTask, PatrolTask, Saturation, Task, UnknownGainGoalTask, VelocityTask
 
 SATURATIONS = [None, Saturation("norm", (0.5, 0.5), dead_speed=0.03), Saturation("box", (0.5, 0.4))]
-BARRIERS = [
+BARRIERS: list[list[Barrier]] = [
     [CollisionAvoidance(ClassK(1.0), safety_distance=0.3)],
     [CollisionAvoidance(ClassK(2.0, 3), safety_distance=0.3, neighbour_velocity="current"), SpeedPolygon(8, 0.45)],
     [
@@ -27,16 +27,15 @@ BARRIERS = [
 ]
 
 
-@pytest.mark.parametrize("saturation", SATURATIONS, ids=["linear", "norm", "box"])
-@pytest.mark.parametrize("barriers", BARRIERS, ids=["squared", "joint", "euclidean"])
-def test_truth_inside_for_a_whole_run(saturation: Saturation | None, barriers: list[Barrier]) -> None:
-    seed = 10 * SATURATIONS.index(saturation) + BARRIERS.index(barriers)
-    generator = torch.Generator().manual_seed(seed)
+@pytest.mark.parametrize(("which", "clipped"), [(0, 0), (1, 0), (2, 0), (0, 1), (1, 2), (2, 1)])
+def test_truth_inside_for_a_whole_run(which: int, clipped: int) -> None:
+    barriers, saturation = BARRIERS[which], SATURATIONS[clipped]
+    generator = torch.Generator().manual_seed(10 * which + clipped)
     task, n = GoalTask(0.8, saturation=saturation), 4
     turn = 2 * math.pi * torch.arange(n, dtype=torch.float64) / n
     start = 1.4 * torch.stack([turn.cos(), turn.sin()], dim=-1)
     goals = -start + 0.2 * torch.randn(n, 2, generator=generator, dtype=torch.float64)
-    run = simulate(CbfQpController(task, barriers), goals, start, dt=0.1, steps=25)
+    run = simulate(CbfQpController(task, barriers), goals, start, dt=0.1, steps=20)
     for position, velocity in [(3e-3, 1e-3), (3e-2, 3e-2)]:
 
         def error(bound: float, at_the_bound: bool) -> torch.Tensor:

@@ -2,6 +2,8 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -16,8 +18,9 @@ from torchfsid.controller import CbfQpController
 from torchfsid.documents import validate
 from torchfsid.logs import Log
 from torchfsid.observation import Observation
+from torchfsid.observer import SetMembershipObserver
 from torchfsid.resampling import Track, log_of_tracks, seconds
-from torchfsid.simulation import simulate
+from torchfsid.simulation import Trajectory, simulate
 from torchfsid.sources import read_log
 from torchfsid.tasks import GoalTask
 
@@ -26,7 +29,7 @@ PERIOD = 0.1
 ROUND_OFF = 1e-9
 
 seeds = st.integers(0, 2**32).map(np.random.default_rng)
-repeatable = settings(deadline=None, derandomize=True, max_examples=100)
+repeatable = settings(deadline=None, derandomize=True, max_examples=60)
 
 
 def smooth(rng: np.random.Generator) -> Motion:
@@ -154,9 +157,9 @@ def test_gaps_and_ends_are_not_bridged():
     still = [np.zeros((len(stamps), 2))] * 2
     tracks = [Track("clock", clock, np.zeros((45, 2)), np.zeros((45, 2))), Track("body", stamps, *still)]
     log = log_of_tracks("test", tracks, None, None)
-    lost = {0.0, 0.05, 1.15 + 0.1, 1.3, 1.35, 1.4 - 0.1 + 0.05, 1.45 - 0.1 + 0.05, 2.05, 2.1, 2.15, 2.2}
+    lost = [0.0, 0.05, *[1.15, 1.2, 1.25, 1.3, 1.35], *[2.05, 2.1, 2.15, 2.2]]
     assert log.lost is not None
-    assert log.t[log.lost[:, 1]].round(2).tolist() == sorted({round(t, 2) for t in lost})
+    assert log.t[log.lost[:, 1]].tolist() == lost
     observed = [m.observed.tolist() for m in log.measurements(["clock", "body"], ()) if m.observed is not None]
     assert observed == [[not gone, not gone] for gone in log.lost[:, 1]]
 
@@ -191,7 +194,7 @@ def test_the_bounds_reach_the_measurements():
     assert log.velocity_error is not None
     assert log.position_error is not None
     for modes in (set(), {"previous"}):
-        for k, m in enumerate(log.measurements(["body"], modes)):
+        for k, m in enumerate(islice(log.measurements(["body"], modes), 20)):
             assert m.position_error is not None
             assert m.body_velocity_error is not None
             assert m.position_error.tolist() == [log.position_error[k, 1]]
@@ -205,18 +208,32 @@ GOALS = torch.tensor([[2.0, 0.1], [-2.0, 0.0], [0.1, 2.0]], dtype=torch.float64)
 START = torch.tensor([[-2.0, 0.0], [2.0, 0.3], [0.0, -2.0]], dtype=torch.float64)
 
 
-@pytest.mark.parametrize(("velocity", "period"), [("logged", 10), ("differentiated", 10), ("logged", 25)])
-def test_the_truth_is_inside_the_sets_of_an_asynchronous_bag(tmp_path, velocity, period):
-    """Messages every `period` steps of the controllers, each robot's at others; the sets forget the truth without the bounds."""
-    run = simulate(
-        CbfQpController(GoalTask(0.9), [CollisionAvoidance(ClassK(1.5), 0.5)]), GOALS, START, dt=0.01, steps=400
-    )
+@cache
+def crossing() -> Trajectory:
+    controller = CbfQpController(GoalTask(0.9), [CollisionAvoidance(ClassK(1.5), 0.5)])
+    return simulate(controller, GOALS, START, dt=0.02, steps=200)
+
+
+def sets_of(config: ObserveConfig, log: Log) -> SetMembershipObserver:
+    """What remains after the whole log; no filter, no figures."""
+    observation = Observation(config, log)
+    for measurement in observation.log.measurements(observation.robots, config.neighbour_velocities):
+        observation.sets.update(measurement)
+    return observation.sets
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("velocity", "period", "diameter"), [("logged", 5, 0.1), ("differentiated", 5, 0.5), ("logged", 12, 0.2)]
+)
+def test_the_truth_is_inside_the_sets_of_an_asynchronous_bag(tmp_path, velocity, period, diameter):
+    """Messages every `period` steps of a controller, each robot's at others. Without the bounds the truth is lost"""
+    run = crossing()
     messages = {}
-    for j, offset in enumerate([0, 3, 7]):
-        steps = range(offset, 401, period)
-        stamp = [round(run.t[k].item() * 1e9) for k in steps]
+    for j, offset in enumerate([0, 1, 3]):
+        stamps = [round(t * 1e9) for t in run.t[offset::period].tolist()]
         x, u = (values[offset::period, j].tolist() for values in (run.x, run.u))
-        messages[f"/{j}"] = [*map(odometry, stamp, x, u)] if velocity == "logged" else [*map(pose, stamp, x)]
+        messages[f"/{j}"] = [*map(odometry, stamps, x, u)] if velocity == "logged" else [*map(pose, stamps, x)]
     config = validate(
         {
             "task": {"kind": "goal", "gain": 0.9},
@@ -230,15 +247,12 @@ def test_the_truth_is_inside_the_sets_of_an_asynchronous_bag(tmp_path, velocity,
         source="config",
     )
     log = read_log(write_bag(tmp_path / "bag", messages), config.bag)
-    observation = Observation(config, log)
-    assert len(list(observation.run(tmp_path / "out"))) == len(observation.log.t)
-    assert [verdict.status for verdict in observation.verdicts()] == ["ok"] * 3
-    assert observation.sets.feasible_set.contains(GOALS, 1e-9).all()
-    assert all(verdict.diameter < 0.2 for verdict in observation.verdicts())
+    sets = sets_of(config, log)
+    assert not sets.status.any()
+    assert sets.feasible_set.contains(GOALS).all()
+    assert (sets.feasible_set.diameter() < diameter).all()
 
-    believed = observation.log if velocity == "differentiated" else log
-    trusting = Observation(
-        config.model_copy(update={"velocity": "logged"}), replace(believed, position_error=None, velocity_error=None)
-    )
-    list(trusting.run(tmp_path / "trusting"))
-    assert not trusting.sets.feasible_set.contains(GOALS, 1e-9).all()
+    believed = log.differentiated() if velocity == "differentiated" else log
+    trusting = config.model_copy(update={"velocity": "logged"})
+    without_bounds = sets_of(trusting, replace(believed, position_error=None, velocity_error=None))
+    assert not without_bounds.feasible_set.contains(GOALS).all()

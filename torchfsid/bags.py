@@ -148,7 +148,7 @@ def _wanted(path: Path, types: dict[str, str], bag: BagConfig) -> set[str]:
         if topic not in types:
             raise ConfigError(f"bag: {path}: no topic is called {topic!r}; there are {reprlib.repr(sorted(types))}")
         if types[topic] not in allowed:
-            raise ConfigError(f"bag: {path}: topic {topic!r} is of type {types[topic]}, not {' or '.join(allowed)}")
+            raise ConfigError(f"bag: {path}: topic {topic!r} is of type {types[topic]!r}, not {' or '.join(allowed)}")
     return set(expected)
 
 

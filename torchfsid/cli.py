@@ -1,4 +1,4 @@
-"""The command line: `torchfsid observe LOG --config CONFIG --out DIR`.
+"""The command line: `torchfsid observe LOG --config CONFIG --out DIR`, `torchfsid check LOG --config CONFIG`.
 
 Everything is validated before PyTorch is loaded and before anything is written: a wrong configuration or log costs a
 moment, one clear line on stderr, and exit code 2.
@@ -17,6 +17,10 @@ from torchfsid.documents import load
 from torchfsid.errors import FsidError
 
 if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from torchfsid.check import Check
     from torchfsid.observation import Observation
 
 USAGE_ERROR, INTERRUPTED = 2, 130
@@ -36,15 +40,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     commands = parser.add_subparsers(dest="command", required=True)
     observe = commands.add_parser("observe", help="infer the sets of a log's robots")
-    observe.add_argument(
-        "log", type=Path, metavar="LOG", help="CSV or Parquet: t, robot, x, y[, vx, vy][, radius]; or a ROS 2 bag"
-    )
-    observe.add_argument("--config", type=Path, required=True, help="YAML: task, barriers, prior, noise, ...")
+    check = commands.add_parser("check", help="does a log fit its declared model?")
+    for command in (observe, check):
+        command.add_argument(
+            "log", type=Path, metavar="LOG", help="CSV or Parquet: t, robot, x, y[, vx, vy][, radius]; or a ROS 2 bag"
+        )
+        command.add_argument("--config", type=Path, required=True, help="YAML: task, barriers, prior, noise, ...")
+        command.add_argument(
+            "--set", action="append", default=[], metavar="A.B=VALUE", help="override a key of the config"
+        )
     observe.add_argument("--out", type=Path, required=True, help="results folder")
-    observe.add_argument("--set", action="append", default=[], metavar="A.B=VALUE", help="override a key of the config")
+    check.add_argument("--out", type=Path, help="folder for check.json")
     chosen = parser.parse_args(arguments)
+    run = {"observe": _observe, "check": _check}[chosen.command]
     try:
-        _observe(chosen.log, chosen.config, chosen.out, chosen.set)
+        run(chosen.log, chosen.config, chosen.out, chosen.set)
     except FsidError as error:
         print(f"torchfsid: {error}", file=sys.stderr)
         return USAGE_ERROR
@@ -52,7 +62,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"torchfsid: {error.filename}: {error.strerror}", file=sys.stderr)
         return USAGE_ERROR
     except KeyboardInterrupt:
-        print(f"torchfsid: interrupted; the results so far are in {chosen.out}", file=sys.stderr)
+        done = "" if chosen.out is None else f"; what is done so far is in {chosen.out}"
+        print(f"torchfsid: interrupted{done}", file=sys.stderr)
         return INTERRUPTED
     return 0
 
@@ -75,24 +86,70 @@ def _observe(log: Path, config: Path, out: Path, overrides: Sequence[str]) -> No
     _print_verdicts(observation, out)
 
 
-def _print_verdicts(observation: Observation, out: Path) -> None:
-    from rich.console import Console
+def _check(log: Path, config: Path, out: Path | None, overrides: Sequence[str]) -> None:
+    model = load(config, ObserveConfig, overrides)
+
+    import torch
+
+    from torchfsid.check import check
+    from torchfsid.results import write_json
+    from torchfsid.scene import Scene
+    from torchfsid.sources import read_log
+
+    torch.set_num_threads(1)
+    found = check(Scene(model, read_log(log, model.bag)))
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        write_json(out / "check.json", found.to_json())
+    _print_check(found)
+
+
+def _print_check(found: Check) -> None:
+    robots = _table("smallest velocity bound and residuals [m/s]", ["robot"])
+    for heading in ("bound", "median", "p95", "max", "at", "samples"):
+        robots.add_column(heading, justify="right")
+    faults = _table(f"at odds with the declared bounds, velocity {found.declared:.3g} m/s", ["robot", "what", "row"])
+    for heading in ("samples", "first", "worst [m/s]"):
+        faults.add_column(heading, justify="right")
+    for robot in found.robots:
+        sizes = [f"{size:.3g}" for size in (robot.smallest_bound, robot.median, robot.p95, robot.worst)]
+        robots.add_row(robot.robot, *sizes, f"{robot.worst_time:g} s", str(robot.samples))
+        for what, listed in (("unexplained", robot.contradictions), ("violated", robot.violations)):
+            for fault in listed:
+                row = f"{fault.row} (soft)" if fault.soft else fault.row
+                size = [str(fault.samples), f"{fault.first:g} s", f"{fault.worst:.3g}"]
+                faults.add_row(robot.robot, what, row, *size)
+    console = _console()
+    console.print(robots)
+    if faults.row_count:
+        console.print(faults)
+    for conclusion in found.conclusions():
+        console.print(f"- {conclusion}", soft_wrap=True)
+
+
+def _table(title: str, texts: Sequence[str]) -> Table:
     from rich.table import Table
 
-    table = Table(title=f"{len(observation.log.t)} samples, set: {observation.config.set}", title_justify="left")
-    for heading in (
-        "robot",
-        "cases",
-        "skipped",
-        "volume",
-        "diameter",
-        "centroid",
-        "centre",
-        "radius",
-        "shrank last",
-        "status",
-    ):
-        table.add_column(heading, justify="left" if heading in ("robot", "cases", "status") else "right", no_wrap=True)
+    table = Table(title=title, title_justify="left")
+    for heading in texts:
+        table.add_column(heading, no_wrap=True)
+    return table
+
+
+def _console() -> Console:
+    from rich.console import Console
+
+    console = Console()
+    if not console.is_terminal:
+        console.width = 160  # a file or a pipe has no width of its own
+    return console
+
+
+def _print_verdicts(observation: Observation, out: Path) -> None:
+    table = _table(f"{len(observation.log.t)} samples, set: {observation.config.set}", ["robot", "cases"])
+    for heading in ("skipped", "volume", "diameter", "centroid", "centre", "radius", "shrank last"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("status", no_wrap=True)
     for verdict in observation.verdicts():
         since = verdict.no_information_since
         table.add_row(
@@ -107,9 +164,7 @@ def _print_verdicts(observation: Observation, out: Path) -> None:
             "never" if since is None else f"{since:g} s",
             verdict.status if verdict.status == "ok" else f"[bold red]{verdict.status}[/]",
         )
-    console = Console()
-    if not console.is_terminal:
-        console.width = 160  # a file or a pipe has no width of its own
+    console = _console()
     console.print(table)
     if observation.smallest_bounds is not None:
         robot, bound = max(observation.smallest_bounds.items(), key=lambda item: item[1])

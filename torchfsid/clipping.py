@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchfsid.polygon import PRIOR, Polygon, cross, excess, lengths, round_off, take
 
-RELATIVE_PARALLEL = 1e-9
+PARALLEL = 1e-14
 """Sine of the angle below which two edges are not extended to their intersection."""
 
 
@@ -91,10 +91,12 @@ def clip(
             row = torch.where(cutting[items], depth, -torch.inf).argmax(-1)
         a, c = A[items, row], b[items, row]
         over = (part.vertices @ a.unsqueeze(-1)).squeeze(-1) - c.unsqueeze(-1)
-        tolerance = round_off(a.unsqueeze(1), c.unsqueeze(1), part.vertices)
+        tolerance = round_off(a.unsqueeze(1), c.unsqueeze(1), part.reach)
         kept, strictly = over <= tolerance, over < -tolerance
-        empty, cut = ~kept.any(-1), strictly.any(-1)
-        outcome[items] = torch.where(empty, Outcome.EMPTY, torch.where(cut, outcome[items], Outcome.UNDECIDED))
+        empty, surely = ~kept.any(-1), strictly.any(-1)
+        outcome[items] = torch.where(empty, Outcome.EMPTY, torch.where(surely, outcome[items], Outcome.UNDECIDED))
+        # Another order of the same sums may have found a vertex beyond the line that this one finds on it.
+        cut = surely & ~kept.all(-1)
         cutting[items, row] = False
 
         if bool(empty.any()):
@@ -119,10 +121,20 @@ def clip(
 
 
 def merge(polygon: Polygon, most: int) -> Polygon:
-    """Outer polygons with at most `most` edges: drop, one by one, the edge whose removal adds the least area."""
-    while len(items := (polygon.count > most).nonzero().squeeze(-1)) > 0:
-        polygon = polygon.replaced(items, _without_cheapest_edge(polygon.select(items)))
-    return polygon
+    """Outer polygons with at most `most` edges: drop, one by one, the edge whose removal adds the least area.
+
+    A polygon whose edges cannot be extended to meet (a parallelogram, extreme needles) keeps them.
+    """
+    while True:
+        over = (polygon.count > most).nonzero().squeeze(-1)
+        part = polygon.select(over)
+        added, corners = _removals(part)
+        possible = added.isfinite().any(-1)
+        if not bool(possible.any()):
+            return polygon
+        dropped = added[possible].argmin(-1, keepdim=True)
+        smaller = _without_edge(part.select(possible), dropped, take(corners[possible], dropped))
+        polygon = polygon.replaced(over[possible], smaller)
 
 
 @dataclass(frozen=True)
@@ -155,66 +167,69 @@ def _cut(polygon: Polygon, line: _Line) -> Polygon:
     leaves = line.over.gather(1, last) < -line.tolerance
     enters = line.over.gather(1, first) < -line.tolerance
 
-    def crossing(inner: Tensor, outer: Tensor) -> Tensor:
-        s_inner, s_outer = line.over.gather(1, inner), line.over.gather(1, outer)
-        start, end = take(polygon.vertices, inner), take(polygon.vertices, outer)
-        return start + (s_inner / (s_inner - s_outer)).unsqueeze(-1) * (end - start)
-
     total = length + leaves + enters
     slot = torch.arange(int(total.max()), device=count.device)
     on_arc = slot < length
     vertices = take(polygon.vertices, torch.where(on_arc, (first + slot) % count, first))
-    vertices = torch.where(((slot == length) & leaves).unsqueeze(-1), crossing(last, after), vertices)
-    vertices = torch.where(((slot == length + leaves) & enters).unsqueeze(-1), crossing(first, before), vertices)
-
-    edge = torch.where(on_arc, (first + slot) % count, before)
-    new, padding = slot == length - 1 + leaves, slot >= total
-
-    def edges(old: Tensor, fresh: Tensor, empty: float) -> Tensor:
-        return torch.where(padding, empty, torch.where(new, fresh.unsqueeze(-1), old.gather(1, edge)))
-
-    return Polygon(
-        vertices=vertices,
-        A=torch.stack([edges(polygon.A[..., i], line.a[..., i], 0.0) for i in (0, 1)], dim=-1),
-        b=edges(polygon.b, line.c, 1.0),
-        time=edges(polygon.time, line.time, float("nan")),
-        source=edges(polygon.source, line.source, PRIOR),
-        count=total.squeeze(-1),
+    vertices = torch.where(((slot == length) & leaves).unsqueeze(-1), _crossing(polygon, line, last, after), vertices)
+    vertices = torch.where(
+        ((slot == length + leaves) & enters).unsqueeze(-1), _crossing(polygon, line, first, before), vertices
     )
 
+    edge = torch.where(on_arc, (first + slot) % count, before)
+    edge = torch.where(slot == length - 1 + leaves, V, torch.where(slot >= total, V + 1, edge))
+    return _ring(polygon, vertices, edge, total.squeeze(-1), line)
 
-def _without_cheapest_edge(polygon: Polygon) -> Polygon:
-    """Drop the edge whose two neighbours, extended until they meet, add the least area."""
+
+def _crossing(polygon: Polygon, line: _Line, inner: Tensor, outer: Tensor) -> Tensor:
+    """Where the ring meets the line, between a vertex within and one beyond."""
+    s_inner, s_outer = line.over.gather(1, inner), line.over.gather(1, outer)
+    start, end = take(polygon.vertices, inner), take(polygon.vertices, outer)
+    return start + (s_inner / (s_inner - s_outer)).unsqueeze(-1) * (end - start)
+
+
+def _removals(polygon: Polygon) -> tuple[Float[Tensor, "B V"], Float[Tensor, "B V 2"]]:
+    """For each edge, the area added if its neighbours are extended until they meet (inf: they do not), and where."""
     count = polygon.count.unsqueeze(-1)
     slot = torch.arange(polygon.slots, device=count.device)
     along = torch.stack([-polygon.A[..., 1], polygon.A[..., 0]], dim=-1)
     incoming, outgoing = take(along, (slot - 1) % count), take(along, (slot + 1) % count)
     chord = take(polygon.vertices, (slot + 1) % count) - polygon.vertices
     turn = cross(incoming, outgoing)
-    meets = (turn > RELATIVE_PARALLEL * lengths(incoming) * lengths(outgoing)) & polygon.valid
-    reach = torch.where(meets, cross(chord, outgoing), 0.0) / torch.where(meets, turn, 1.0)
-    added = torch.where(meets, reach * cross(incoming, chord), torch.inf)
-    dropped = added.detach().argmin(-1, keepdim=True)
+    meets = (turn > PARALLEL * lengths(incoming) * lengths(outgoing)) & polygon.valid
+    extended = torch.where(meets, cross(chord, outgoing), 0.0) / torch.where(meets, turn, 1.0)
+    added = torch.where(meets, extended * cross(incoming, chord), torch.inf)
+    return added.detach(), polygon.vertices + extended.unsqueeze(-1) * incoming
 
-    corner = take(polygon.vertices + reach.unsqueeze(-1) * incoming, dropped)
-    slot = slot[:-1]
-    position = torch.where(slot < count - 1, (dropped + 1 + slot) % count, (dropped + 1) % count)
+
+def _without_edge(polygon: Polygon, dropped: Int[Tensor, "B 1"], corner: Float[Tensor, "B 1 2"]) -> Polygon:
+    """Each ring without one edge, its two ends replaced by the corner in which the neighbours meet."""
+    count, V = polygon.count.unsqueeze(-1), polygon.slots
+    slot = torch.arange(V - 1, device=count.device)
     padding = slot >= count - 1
+    position = torch.where(padding, 0, (dropped + 1 + slot) % count)
+    vertices = torch.where(((slot == 0) | padding).unsqueeze(-1), corner, take(polygon.vertices, position))
+    return _ring(polygon, vertices, torch.where(padding, V + 1, position), polygon.count - 1)
 
-    def edges(old: Tensor, empty: float) -> Tensor:
-        return torch.where(padding, empty, old.gather(1, position))
 
-    return Polygon(
-        vertices=torch.where(((slot == 0) | padding).unsqueeze(-1), corner, take(polygon.vertices, position)),
-        A=torch.stack([edges(polygon.A[..., i], 0.0) for i in (0, 1)], dim=-1),
-        b=edges(polygon.b, 1.0),
-        time=edges(polygon.time, float("nan")),
-        source=edges(polygon.source, PRIOR),
-        count=polygon.count - 1,
-    )
+def _ring(
+    polygon: Polygon,
+    vertices: Float[Tensor, "B W 2"],
+    edge: Int[Tensor, "B W"],
+    count: Int[Tensor, "B"],
+    line: _Line | None = None,
+) -> Polygon:
+    """New rings whose edges are old ones by their slot, or V: the new line, or V + 1: padding."""
+    none = polygon.padding()
+    new = none if line is None else (line.a, line.c, line.time, line.source)
+    old = (polygon.A, polygon.b, polygon.time, polygon.source)
+    tables = [torch.cat([o, n.unsqueeze(1), p.unsqueeze(1)], dim=1) for o, n, p in zip(old, new, none, strict=True)]
+    A, *others = tables
+    b, time, source = (table.gather(1, edge) for table in others)
+    return Polygon(vertices, take(A, edge), b, time, source, count, polygon.reach)
 
 
 @torch.no_grad()
 def _cuts(polygon: Polygon, A: Float[Tensor, "B R 2"], b: Float[Tensor, "B R"]) -> Bool[Tensor, "B R"]:
     """Rows that some vertex exceeds by more than round-off."""
-    return excess(A, b, polygon.vertices).amax(-1) > round_off(A, b, polygon.vertices)
+    return excess(A, b, polygon.vertices).amax(-1) > round_off(A, b, polygon.reach)

@@ -66,12 +66,16 @@ class _Evaluated:
 
 
 @dataclass(frozen=True)
-class _Block:
+class Block:
     """Some samples of all robots as one batch, sample by sample."""
 
     times: Float[Tensor, "samples"]
     task: _Evaluated
     measurement: Measurement
+
+    def repeated(self, of_robots: Tensor) -> Tensor:
+        """What is known of each robot, for each of its samples."""
+        return of_robots.repeat(len(self.times), *[1] * (of_robots.ndim - 1))
 
 
 class Consistency:
@@ -105,7 +109,8 @@ class Consistency:
         """delta_i of every robot [m/s], at most by `RESOLUTION` too large; infinite if it is above `largest`."""
         high = torch.full((self.robots,), largest, dtype=torch.float64)
         possible = self.sets(high)[1]
-        low = torch.full_like(high, min(SMALLEST, largest / RESOLUTION))
+        low = torch.full_like(high, min(SMALLEST, largest))
+        high = torch.where(self.sets(low)[1], low, high)
         while bool((high > low * RESOLUTION)[possible].any()):
             middle = (low * high).sqrt()
             fits = self.sets(middle, possible)[1]
@@ -124,7 +129,7 @@ class Consistency:
         while True:
             before = theta.volume()
             for block in self.blocks:
-                reading = self.read(block, theta, velocity.repeat(len(block.times)))
+                reading = self.read(block, theta, block.repeated(velocity))
                 if self.slack is None:
                     fits = fits & ~self._by_robot(reading.alarmed).any(0)
                 rows = reading.omega
@@ -153,23 +158,25 @@ class Consistency:
             found.append(self._by_robot(torch.where(possible, high, math.inf).where(says, math.nan)))
         return torch.cat(found)
 
-    def read(self, block: _Block, theta: FeasibleSet, velocity: Float[Tensor, "items"]) -> Reading:
+    def read(self, block: Block, theta: FeasibleSet, velocity: Float[Tensor, "items"]) -> Reading:
         """What a block of samples says, each item with its velocity bound, while Theta is known."""
-        items = torch.arange(self.robots).repeat(len(block.times))
+        items = block.repeated(torch.arange(self.robots))
         noise = NoiseBound(
             velocity,
             None if self.slack is None else torch.full_like(velocity, self.slack),
             self.position,
             self.neighbour_velocity,
         )
-        return SetMembershipObserver(block.task, self.barriers, theta.select(items), noise=noise).read(block.measurement)
+        return SetMembershipObserver(block.task, self.barriers, theta.select(items), noise=noise).read(
+            block.measurement
+        )
 
     def _meets(
-        self, block: _Block, theta: FeasibleSet, velocity: Float[Tensor, "items"]
+        self, block: Block, theta: FeasibleSet, velocity: Float[Tensor, "items"]
     ) -> tuple[Bool[Tensor, "items"], Bool[Tensor, "items"]]:
         """Does each sample's set meet Theta, and was the sample measured at all?"""
         reading = self.read(block, theta, velocity)
-        items = torch.arange(self.robots).repeat(len(block.times))
+        items = block.repeated(torch.arange(self.robots))
         meets = ~theta.select(items).intersect(reading.omega).is_empty
         if self.slack is None:
             meets = meets & ~reading.alarmed
@@ -179,14 +186,14 @@ class Consistency:
         return items.unflatten(0, (-1, self.robots))
 
 
-def _block(samples: Sequence[Measurement], task: Task) -> _Block:
+def _block(samples: Sequence[Measurement], task: Task) -> Block:
     def joined(name: str) -> Any:
         values = [getattr(sample, name) for sample in samples]
         return None if values[0] is None else torch.cat(values)
 
     C, d = zip(*(task(sample) for sample in samples), strict=True)
     together = {field.name: joined(field.name) for field in fields(Measurement) if field.name != "t"}
-    return _Block(
+    return Block(
         times=torch.tensor([sample.t for sample in samples], dtype=torch.float64),
         task=_Evaluated(task, (torch.cat(C), torch.cat(d))),
         measurement=Measurement(t=samples[0].t, **together),

@@ -121,7 +121,7 @@ def inverse_optimal_set(
         may_be_active = torch.cat([may_be_active] * len(SPREAD), dim=-1)
 
     normals, generator = outward_normals(generators, may_be_active, FAN)
-    source = m + torch.where(generator < generators.shape[-2], generator % m, m)
+    source = m + torch.where(generator < generators.shape[-2], generator % max(m, 1), m)
     along_u = (normals @ u.unsqueeze(-1)).squeeze(-1)
     nominal = Halfspaces(normals, along_u + ball.unsqueeze(-1), source).where((normals != 0).any(-1))
     if saturation is not None:

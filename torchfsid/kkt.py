@@ -29,7 +29,7 @@ from torchfsid.halfspaces import Halfspaces
 CASES = "ABCDE"
 """Table I of the paper: A none active; B one; C several, rank 1; D two, rank 2; E three or more, rank 2."""
 
-RANK_TOLERANCE = 1e-9
+RANK_TOLERANCE = 1e-6
 """Unit rows closer to parallel than this [rad] count as parallel."""
 
 ANGLE_TOLERANCE = 1e-12

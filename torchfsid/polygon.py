@@ -26,7 +26,11 @@ PRIOR = -1
 
 @dataclass(frozen=True)
 class Polygon:
-    """A batch of convex polygons. `time` and `source` say when and from which constraint each edge came."""
+    """A batch of convex polygons.
+
+    `time` and `source` say when and from which constraint each edge came; `reach` is the largest |coordinate| that the
+    set ever had, for round-off is inherited.
+    """
 
     vertices: Float[Tensor, "B V 2"]
     A: Float[Tensor, "B V 2"]
@@ -34,6 +38,7 @@ class Polygon:
     time: Float[Tensor, "B V"]
     source: Int[Tensor, "B V"]
     count: Int[Tensor, "B"]
+    reach: Float[Tensor, "B 2"]
 
     @classmethod
     def from_box(cls, lower: Float[Tensor, "B 2"], upper: Float[Tensor, "B 2"]) -> Polygon:
@@ -48,6 +53,7 @@ class Polygon:
             time=lower.new_full((len(lower), 4), float("nan")),
             source=torch.full((len(lower), 4), PRIOR, device=lower.device),
             count=torch.full((len(lower),), 4, device=lower.device),
+            reach=torch.maximum(lower.abs(), upper.abs()).detach(),
         )
 
     @property
@@ -74,20 +80,23 @@ class Polygon:
         )
 
     def _fields(self) -> tuple[Tensor, ...]:
-        return self.vertices, self.A, self.b, self.time, self.source, self.count
+        return self.vertices, self.A, self.b, self.time, self.source, self.count, self.reach
+
+    def padding(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """A, b, time and source of a slot without an edge: 0.z <= 1."""
+        nothing = torch.zeros_like(self.b[:, 0])
+        return torch.zeros_like(self.A[:, 0]), nothing + 1, nothing + torch.nan, torch.full_like(self.count, PRIOR)
 
     def _widened(self, slots: int) -> Polygon:
         extra = slots - self.slots
         if extra == 0:
             return self
-        return Polygon(
-            vertices=torch.cat([self.vertices, self.vertices[:, :1].expand(-1, extra, 2)], dim=1),
-            A=torch.nn.functional.pad(self.A, (0, 0, 0, extra)),
-            b=torch.nn.functional.pad(self.b, (0, extra), value=1.0),
-            time=torch.nn.functional.pad(self.time, (0, extra), value=float("nan")),
-            source=torch.nn.functional.pad(self.source, (0, extra), value=PRIOR),
-            count=self.count,
+        first, fields = self.vertices[:, 0], (self.vertices, self.A, self.b, self.time, self.source)
+        vertices, A, b, time, source = (
+            torch.cat([field, fill.unsqueeze(1).expand(-1, extra, *fill.shape[1:])], dim=1)
+            for field, fill in zip(fields, (first, *self.padding()), strict=True)
         )
+        return Polygon(vertices, A, b, time, source, self.count, self.reach)
 
     # What is asked of a polygon ------------------------------------------------------------------------------------
 
@@ -216,6 +225,6 @@ def excess(A: Float[Tensor, "B R 2"], b: Float[Tensor, "B R"], z: Float[Tensor, 
     return A @ z.transpose(1, 2) - b.unsqueeze(-1)
 
 
-def round_off(A: Float[Tensor, "B R 2"], b: Float[Tensor, "B R"], z: Float[Tensor, "B V 2"]) -> Float[Tensor, "B R"]:
-    """Round-off of A z - b over the points."""
-    return (ROUND_OFF * (A.abs() @ z.abs().amax(1).unsqueeze(-1)).squeeze(-1) + ROUND_OFF * b.abs()).detach()
+def round_off(A: Float[Tensor, "B R 2"], b: Float[Tensor, "B R"], reach: Float[Tensor, "B 2"]) -> Float[Tensor, "B R"]:
+    """Round-off of A z - b at points that came from coordinates as large as `reach`."""
+    return (ROUND_OFF * ((A.abs() @ reach.unsqueeze(-1)).squeeze(-1) + b.abs())).detach()

@@ -359,12 +359,15 @@ def _nearest(cell: _Cell, point: Reals, metric: Reals) -> Reals:
         return point
     try:
         root = np.linalg.inv(np.linalg.cholesky(metric)).T
-        rows = cell.A @ root
-        G, h = -rows / _lengths(rows)[:, None], (cell.A @ point - cell.b) / _lengths(rows)
+        norms = _lengths(cell.A @ root)
+        G, h = cell.A @ -root / norms[:, None], (cell.A @ point - cell.b) / norms
         y, _ = nnls(np.vstack([G.T, h / h.max()]), np.append(np.zeros(len(point)), 1.0))
     except (np.linalg.LinAlgError, RuntimeError) as error:
         raise SolverError("no nearest point: the metric is not positive definite, or the solver stalled") from error
-    return point + root @ np.linalg.lstsq(G[y > 0], h[y > 0])[0]
+    active = y > 0
+    foot = point + root @ np.linalg.lstsq(G[active], h[active])[0]
+    # Once more from there: from far away, round-off has left the foot beside the set.
+    return foot + root @ np.linalg.lstsq(G[active], ((cell.A @ foot - cell.b) / norms)[active])[0]
 
 
 class _Row(NamedTuple):
@@ -380,7 +383,7 @@ class _Row(NamedTuple):
 
 def _intersect(
     cell: _Cell, A: Reals, b: Reals, time: float, source: NDArray[np.int64]
-) -> tuple[_Cell, Outcome, tuple[Reals, ...]]:
+) -> tuple[_Cell, Outcome, tuple[NDArray, ...]]:
     """While a row cuts by more than round-off, cut by the one that cuts deepest; if nothing is left, say which rows."""
     before, outcome, pending = cell, Outcome.NONEMPTY, np.ones(len(A), dtype=bool)
     while True:
@@ -440,7 +443,7 @@ def _maximal(sets: Mask) -> Mask:
     return np.logical_not(((common >= size[:, None]) & elsewhere).any(axis=1))
 
 
-def _contradiction(cell: _Cell, row: _Row) -> tuple[Reals, ...]:
+def _contradiction(cell: _Cell, row: _Row) -> tuple[NDArray, ...]:
     """The row that every vertex exceeds and facets at the vertex nearest to it, y >= 0: a + sum y_f A_f = 0.
 
     Nothing if round-off leaves open whether they contradict each other.

@@ -106,6 +106,13 @@ def describe(sets: FeasibleSet) -> list[list[str]]:
     return [_numbers(row) for row in torch.cat(columns, dim=-1)]
 
 
+def constraint_name(source: int, labels: Sequence[str]) -> str:
+    """What a `source` of `critical_region` or `inverse_optimal_set` stands for, given the labels of the rows."""
+    if source < 0:
+        return "prior"
+    return labels[source % len(labels)] if source < 2 * len(labels) else "nominal control"
+
+
 def regions(robots: Sequence[str], observer: SetMembershipObserver) -> dict:
     """The final sets, as regions.json holds them.
 

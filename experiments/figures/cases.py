@@ -48,7 +48,7 @@ def draw_cases(results: Results, config: CasesConfig) -> Figure:
     handles = [
         Line2D([], [], color=ACTIVE, lw=1.8),
         Line2D([], [], color="0.65", lw=0.9),
-        Line2D([], [], color="black", ls="", marker="o", mfc="white", ms=5.5),
+        Line2D([], [], color="black", ls="", marker="o", mfc="white", ms=8),
         Line2D([], [], color=ROBOT, ls="", marker="o", ms=5.5),
         Line2D([], [], color="black", ls="", marker="*", ms=9),
         Line2D([], [], color=UKF, ls="", marker="x", ms=6, mew=1.6),
@@ -83,7 +83,7 @@ def _draw_rows(axes: Axes, region: Region, reach: float) -> None:
         )
         axes.plot(*edge.T, color=ACTIVE if active else "0.65", lw=1.8 if active else 0.9, zorder=2)
     axes.plot(*np.array([region.nominal, region.u]).T, color="0.3", lw=0.8, ls=(0, (2, 1.5)), zorder=3)
-    axes.plot(*region.nominal, "o", color="black", mfc="white", ms=5.5, zorder=4)
+    axes.plot(*region.nominal, "o", color="black", mfc="white", ms=8.5, zorder=4)
     axes.plot(*region.u, "o", color=ROBOT, mec="white", mew=0.6, ms=6.5, zorder=5)
     axes.plot(0, 0, "+", color="0.4", ms=6, mew=0.8)
     axes.set(xlim=(-0.6 * reach, reach), ylim=(-0.8 * reach, 0.8 * reach), aspect="equal", xlabel="$u_x$ [m/s]")
