@@ -121,11 +121,13 @@ def test_without_the_extra(tmp_path, monkeypatch):
 @settings(deadline=None, derandomize=True, max_examples=200)
 @given(data=st.data())
 def test_damaged_files_are_one_line(tmp_path_factory, data):
-    """Cut off, overwritten, or with bytes missing."""
+    """Cut off, overwritten, with bytes missing, or a single byte changed."""
     path = write(tmp_path_factory.mktemp("damaged") / "log.parquet", COLUMNS)
     content = path.read_bytes()
     first, second = sorted(data.draw(st.tuples(*[st.integers(0, len(content))] * 2)))
-    damage = data.draw(st.sampled_from([b"", b"\xff" * (second - first), b"\x00" * (second - first), b"end"]))
+    damage = data.draw(st.sampled_from([b"", b"\xff" * (second - first), b"\x00" * (second - first), b"end", None]))
+    if damage is None:
+        second, damage = first + 1, data.draw(st.binary(min_size=1, max_size=1))
     path.write_bytes(content[:first] + damage + content[second:])
     message, log = "", None
     try:
@@ -136,15 +138,3 @@ def test_damaged_files_are_one_line(tmp_path_factory, data):
     if log is not None:
         assert np.isfinite(log.x).all()
         assert (np.diff(log.t) > 0).all()
-
-
-def test_a_column_with_fewer_rows_than_the_file_says(tmp_path):
-    path = write(tmp_path / "log.parquet", COLUMNS)
-    content, lost = path.read_bytes(), 0
-    for i in range(len(content)):
-        path.write_bytes(content[:i] + bytes([content[i] ^ 6]) + content[i + 1 :])
-        try:
-            read_log(path)
-        except LogError as error:
-            lost += "rows in column" in str(error)
-    assert lost

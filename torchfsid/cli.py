@@ -8,19 +8,19 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from torchfsid.config import ObserveConfig
-from torchfsid.documents import load
 from torchfsid.errors import FsidError
+from torchfsid.models import load_models
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
     from torchfsid.check import Check
+    from torchfsid.hypotheses import Hypotheses, HypothesisVerdict
     from torchfsid.observation import Observation
 
 USAGE_ERROR, INTERRUPTED = 2, 130
@@ -69,25 +69,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _observe(log: Path, config: Path, out: Path, overrides: Sequence[str]) -> None:
-    model = load(config, ObserveConfig, overrides)
+    models = load_models(config, overrides)
 
     import torch
-    from rich.console import Console
     from rich.progress import track
 
+    from torchfsid.hypotheses import Hypotheses
     from torchfsid.observation import Observation
     from torchfsid.sources import read_log
 
     torch.set_num_threads(1)  # small tensors: more threads only wait for each other
-    observation = Observation(model, read_log(log, model.bag))
-    total = len(observation.log.t)
-    for _ in track(observation.run(out), "Observing", total=total, console=Console(stderr=True)):
+    first = next(iter(models.values()))
+    recorded = read_log(log, first.bag)
+    run = Observation(first, recorded) if len(models) == 1 else Hypotheses(models, recorded)
+    for _ in track(run.run(out), "Observing", total=run.samples, console=_console(stderr=True)):
         pass
-    _print_verdicts(observation, out)
+    if isinstance(run, Observation):
+        _print_verdicts(run, out)
+    else:
+        _print_hypotheses(run, out)
 
 
 def _check(log: Path, config: Path, out: Path | None, overrides: Sequence[str]) -> None:
-    model = load(config, ObserveConfig, overrides)
+    models = load_models(config, overrides)
 
     import torch
 
@@ -97,14 +101,60 @@ def _check(log: Path, config: Path, out: Path | None, overrides: Sequence[str]) 
     from torchfsid.sources import read_log
 
     torch.set_num_threads(1)
-    found = check(Scene(model, read_log(log, model.bag)))
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        write_json(out / "check.json", found.to_json())
-    _print_check(found)
+    for name, model in models.items():
+        found = check(Scene(model, read_log(log, model.bag)))
+        if out is not None:
+            (out / name).mkdir(parents=True, exist_ok=True)
+            write_json(out / name / "check.json", found.to_json())
+        if name:
+            _console().print(f"[bold]{name}[/]")
+        _print_check(found)
+
+
+def _print_hypotheses(hypotheses: Hypotheses, out: Path) -> None:
+    from rich.markup import escape
+
+    names = list(hypotheses.observations)
+    table = _table("which task is it?", ["robot", *names, "left"])
+    for robot, verdicts in hypotheses.verdicts().items():
+        cells, left = [], []
+        for name in names:
+            verdict = verdicts.get(name)
+            if verdict is None:
+                cells.append("-")
+            elif verdict.refuted_at is not None:
+                cells.append(f"refuted at {verdict.refuted_at:g} s by {' / '.join(_rows(verdict))}")
+            else:
+                left.append(name)
+                alarm = "" if verdict.status == "ok" else f", [bold red]{verdict.status}[/]"
+                cells.append(f"possible, volume {verdict.volume:.3g}{alarm}")
+        table.add_row(escape(robot), *cells, ", ".join(left) or "[bold red]none[/]")
+    console = _console()
+    console.print(table)
+    _print_bound(console, hypotheses.smallest_bounds, hypotheses.velocity_bound)
+    console.print(f"Results: {out}/hypotheses.json, and a folder for each of {', '.join(names)}")
+
+
+def _rows(verdict: HypothesisVerdict) -> list[str]:
+    """The rows of the evidence, each once."""
+    from rich.markup import escape
+
+    return [escape(row) for row in dict.fromkeys(row for _, row in verdict.evidence)]
+
+
+def _print_bound(console: Console, smallest: Mapping[str, float] | None, used: float) -> None:
+    from rich.markup import escape
+
+    if smallest is not None:
+        robot = max(smallest, key=lambda robot: smallest[robot])
+        console.print(
+            escape(f"noise.velocity: auto found {smallest[robot]:.3g} m/s (robot {robot}), takes {used:.3g} m/s")
+        )
 
 
 def _print_check(found: Check) -> None:
+    from rich.markup import escape
+
     robots = _table("smallest velocity bound and residuals [m/s]", ["robot"])
     for heading in ("bound", "median", "p95", "max", "at", "samples"):
         robots.add_column(heading, justify="right")
@@ -113,18 +163,18 @@ def _print_check(found: Check) -> None:
         faults.add_column(heading, justify="right")
     for robot in found.robots:
         sizes = [f"{size:.3g}" for size in (robot.smallest_bound, robot.median, robot.p95, robot.worst)]
-        robots.add_row(robot.robot, *sizes, f"{robot.worst_time:g} s", str(robot.samples))
+        robots.add_row(escape(robot.robot), *sizes, f"{robot.worst_time:g} s", str(robot.samples))
         for what, listed in (("unexplained", robot.contradictions), ("violated", robot.violations)):
             for fault in listed:
-                row = f"{fault.row} (soft)" if fault.soft else fault.row
+                row = escape(f"{fault.row} (soft)" if fault.soft else fault.row)
                 size = [str(fault.samples), f"{fault.first:g} s", f"{fault.worst:.3g}"]
-                faults.add_row(robot.robot, what, row, *size)
+                faults.add_row(escape(robot.robot), what, row, *size)
     console = _console()
     console.print(robots)
     if faults.row_count:
         console.print(faults)
     for conclusion in found.conclusions():
-        console.print(f"- {conclusion}", soft_wrap=True)
+        console.print(f"- {escape(conclusion)}", soft_wrap=True)
 
 
 def _table(title: str, texts: Sequence[str]) -> Table:
@@ -136,16 +186,18 @@ def _table(title: str, texts: Sequence[str]) -> Table:
     return table
 
 
-def _console() -> Console:
+def _console(stderr: bool = False) -> Console:
     from rich.console import Console
 
-    console = Console()
+    console = Console(stderr=stderr)
     if not console.is_terminal:
         console.width = 160  # a file or a pipe has no width of its own
     return console
 
 
 def _print_verdicts(observation: Observation, out: Path) -> None:
+    from rich.markup import escape
+
     table = _table(f"{len(observation.log.t)} samples, set: {observation.config.set}", ["robot", "cases"])
     for heading in ("skipped", "volume", "diameter", "centroid", "centre", "radius", "shrank last"):
         table.add_column(heading, justify="right", no_wrap=True)
@@ -153,7 +205,7 @@ def _print_verdicts(observation: Observation, out: Path) -> None:
     for verdict in observation.verdicts():
         since = verdict.no_information_since
         table.add_row(
-            verdict.robot,
+            escape(verdict.robot),
             " ".join(f"{case}:{count}" for case, count in verdict.cases.items() if count),
             str(verdict.skipped),
             f"{verdict.volume:.3g}",
@@ -166,10 +218,7 @@ def _print_verdicts(observation: Observation, out: Path) -> None:
         )
     console = _console()
     console.print(table)
-    if observation.smallest_bounds is not None:
-        robot, bound = max(observation.smallest_bounds.items(), key=lambda item: item[1])
-        used = observation.config.noise.velocity
-        console.print(f"noise.velocity: auto found {bound:.3g} m/s (robot {robot}), used: {used:.3g} m/s")
+    _print_bound(console, observation.smallest_bounds, observation.velocity_bound)
     console.print(f"Results: {out}/estimates.csv, regions.json, config.yaml, regions.png, regions.pdf")
 
 

@@ -285,12 +285,13 @@ class ObservedNoiseConfig(_Noise):
 
     @field_validator("velocity", mode="plain")
     @classmethod
-    def _is_bound_or_auto(cls, value: object) -> object:
+    def _is_bound_or_auto(cls, value: object) -> float | Literal["auto"]:
+        if value == "auto":
+            return "auto"
         bound = as_number(value)
-        is_number = isinstance(bound, int | float) and not isinstance(bound, bool) and math.isfinite(bound)
-        if bound != "auto" and not (is_number and bound >= 0):
+        if not isinstance(bound, int | float) or isinstance(bound, bool) or not 0 <= bound < math.inf:
             raise wrong(f"expected a bound of at least 0 m/s or 'auto', got {reprlib.repr(value)}")
-        return float(bound) if is_number else bound
+        return float(bound)
 
     def build(self) -> NoiseBound:
         """Raises `ConfigError` for `auto`: someone has to find the bound first."""

@@ -1,6 +1,6 @@
 r"""How large the errors must be for a log to fit its declared model, whatever the truth is.
 
-    delta_i = min { delta : the sets of robot i's samples with velocity bound delta have a point of the prior in common }
+    delta_i = min { delta : the sets of robot i's samples with velocity bound delta share a point of the prior }
 
 A set grows with its bound, so bisection finds delta_i; below it no parameter explains robot i. A hard row that is
 violated by more than its bound is a contradiction too, if `slack` follows `velocity`. The residual of one sample is the
@@ -14,7 +14,7 @@ observer's, and an observer with bound delta_i finds no contradiction but by the
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -103,7 +103,7 @@ class Consistency:
         self.robots = prior.batch_shape[0]
         blocks = [measurements[k : k + BLOCK] for k in range(0, len(measurements), BLOCK)]
         self.blocks = [_block(samples, task) for samples in blocks]
-        self.fastest = max(float(block.measurement.u.norm(dim=-1).max()) for block in self.blocks)
+        self.fastest = max(float(sample.u.norm(dim=-1).max()) for sample in measurements if sample.u is not None)
 
     def smallest_bounds(self, largest: float) -> Float[Tensor, "B"]:
         """delta_i of every robot [m/s], at most by `RESOLUTION` too large; infinite if it is above `largest`."""
@@ -149,8 +149,9 @@ class Consistency:
         for block in self.blocks:
             items = len(block.times) * self.robots
             high = torch.full((items,), largest, dtype=torch.float64)
-            low = torch.full_like(high, min(SMALLEST, largest / RESOLUTION))
+            low = torch.full_like(high, min(SMALLEST, largest))
             possible, says = self._meets(block, theta, high)
+            high = torch.where(self._meets(block, theta, low)[0], low, high)
             while bool((high > low * RESOLUTION)[possible].any()):
                 middle = (low * high).sqrt()
                 meets, _ = self._meets(block, theta, middle)

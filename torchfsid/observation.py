@@ -18,7 +18,7 @@ from torchfsid.kkt import CASES
 from torchfsid.logs import Log
 from torchfsid.observer import SetMembershipObserver, Status
 from torchfsid.results import STATUS_NAMES, ResultsWriter, write_json
-from torchfsid.scene import AUTO_FACTOR, Scene
+from torchfsid.scene import AUTO_FACTOR, Scene, automatic_bound
 from torchfsid.ukf import ParameterUkf
 
 
@@ -48,7 +48,7 @@ class Observation:
         smallest_bounds: for each robot the smallest velocity bound that explains its motion [m/s], if it said `auto`.
 
     Raises:
-        ConfigError: see `Scene`.
+        ConfigError: see `Scene` and `automatic_bound`.
     """
 
     config: ObserveConfig
@@ -64,7 +64,7 @@ class Observation:
         self.scene = scene = Scene(self.config, self.log)
         if self.config.noise.velocity == "auto":
             self.smallest_bounds = scene.smallest_bounds()
-            self.config = self.config.with_velocity_bound(AUTO_FACTOR * max(self.smallest_bounds.values()))
+            self.config = self.config.with_velocity_bound(automatic_bound(self.smallest_bounds))
         config, self.log, self.robots = self.config, scene.log, scene.robots
         self._cases = {robot: Counter() for robot in self.robots}
         self.sets = SetMembershipObserver(
@@ -92,12 +92,23 @@ class Observation:
         )
         self.hybrid = HybridObserver(self.sets, ukf, feedback=config.ukf.feedback)
 
+    @property
+    def samples(self) -> int:
+        """How many there are to read."""
+        return len(self.log.t)
+
+    @property
+    def velocity_bound(self) -> float:
+        """The bound in use [m/s]."""
+        assert self.config.noise.velocity != "auto"
+        return self.config.noise.velocity
+
     def run(self, out: Path) -> Iterator[float]:
         """Observe the whole log into the folder `out`, yielding the time of each sample done; the figure comes last."""
         with ResultsWriter(out, self.robots, self.sets) as results:
             (out / "config.yaml").write_text(dump(self.config), encoding="utf-8")
             if self.smallest_bounds is not None:
-                found = {"smallest": self.smallest_bounds, "factor": AUTO_FACTOR, "used": self.config.noise.velocity}
+                found = {"smallest": self.smallest_bounds, "factor": AUTO_FACTOR, "used": self.velocity_bound}
                 write_json(out / "velocity_bound.json", found)
             for measurement in self.scene.measurements():
                 estimate = self.hybrid.update(measurement)

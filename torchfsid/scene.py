@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -105,17 +106,22 @@ class Scene:
         return replace(self, config=self.config.model_copy(update={"velocity": "logged"}), log=shifted)
 
     def smallest_bounds(self) -> dict[str, float]:
-        """For each robot the smallest velocity bound with which the model explains its motion [m/s].
-
-        Raises:
-            ConfigError: no bound up to the largest speed in the log does, for some robot.
-        """
+        """For each robot the smallest velocity bound with which the model explains its motion [m/s]; infinite if none
+        up to the largest speed in the log does."""
         consistency = self.consistency()
-        found = dict(zip(self.robots, consistency.smallest_bounds(consistency.fastest).tolist(), strict=True))
-        for robot, bound in found.items():
-            if bound == float("inf"):
-                raise ConfigError(
-                    f"noise.velocity: auto finds no bound that explains robot {robot!r}, up to {consistency.fastest:.4g} "
-                    "m/s, the largest speed in the log: the model is wrong (see `torchfsid check`)"
-                )
-        return found
+        return dict(zip(self.robots, consistency.smallest_bounds(consistency.fastest).tolist(), strict=True))
+
+
+def automatic_bound(smallest: Mapping[str, float]) -> float:
+    """What `noise.velocity: auto` takes, given the robots' smallest bounds [m/s].
+
+    Raises:
+        ConfigError: one of them is infinite.
+    """
+    unexplained = [robot for robot, bound in smallest.items() if bound == math.inf]
+    if unexplained:
+        raise ConfigError(
+            f"noise.velocity: auto: no bound up to the largest speed in the log explains robot {unexplained[0]!r}; "
+            "the model is wrong (torchfsid check says where)"
+        )
+    return AUTO_FACTOR * max(smallest.values())

@@ -167,9 +167,12 @@ class ParquetTable:
 
         try:
             cells = self.file.read(columns=[column]).column(column).combine_chunks()
+            cells.validate(full=True)
             cells = cells.dictionary_decode() if types.is_dictionary(cells.type) else cells
         except Exception as error:  # of many kinds, as above: the pages are parsed only now
             raise LogError(f"{self.source}: not valid Parquet: {one_line(error)}") from error
         if len(cells) != self.file.metadata.num_rows:
-            raise LogError(f"{self.source}: not valid Parquet: {len(cells)} rows in column {column!r}, others in the file")
+            raise LogError(
+                f"{self.source}: not valid Parquet: {len(cells)} rows in column {column!r}, others in the file"
+            )
         return cells
