@@ -1,4 +1,4 @@
-"""The tests, and the type checker that runs under them: shapes as annotated, an int where a float is wanted (PEP 484)."""
+"""The tests, and the type checker that runs under them: shapes as annotated, an int where a float is wanted."""
 
 from beartype import BeartypeConf, beartype
 

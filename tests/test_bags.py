@@ -5,6 +5,8 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import yaml
 from hypothesis import given, settings
@@ -13,6 +15,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from tests.bag_writer import odometry, odometry_of, pose, section_of, transforms, write_bag, yawed
 from torchfsid.bags import BagConfig, read_bag
+from torchfsid.cli import main
 from torchfsid.documents import validate
 from torchfsid.errors import ConfigError, FsidError, LogError
 from torchfsid.logs import Log, read_csv
@@ -179,6 +182,33 @@ def test_the_clock(tmp_path):
     np.testing.assert_allclose(read_bag(path, section(topics=topics, rate=3.0)).t, [0, 1 / 3, 2 / 3, 1], atol=1e-9)
     assert refusal(path, section(topics=topics, rate=0.5)).startswith("bag.rate: 0.5 Hz makes 1.5 times")
     assert refusal(path, section(topics=topics, rate=1e300)).startswith("bag.rate: 1e+300 Hz makes 1e+300 times")
+
+
+def test_observe_gives_the_same_regions_from_every_kind_of_log(csv_log, tmp_path, capsys):
+    config = {
+        "task": {"kind": "goal", "gain": 0.5},
+        "barriers": [{"kind": "avoidance", "margin": 0.1, "class_k": {"gain": 1}, "neighbour_velocity": "current"}],
+        "prior": {"lower": [-5, -5], "upper": [5, 5]},
+        "noise": {"velocity": 0.01},
+        "bag": section_of(csv_log),
+    }
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))
+    (tmp_path / "log.csv").write_text(CSV)
+    columns = zip(*[line.split(",") for line in CSV.splitlines()], strict=True)
+    table = {name: cells if name == "robot" else [*map(float, cells)] for name, *cells in columns}
+    pq.write_table(pa.table(table), tmp_path / "log.parquet")
+    write_bag(tmp_path / "bag", odometry_of(csv_log))
+    results = []
+    for log in ("log.csv", "log.parquet", "bag"):
+        out = tmp_path / "out" / log
+        arguments = ["observe", str(tmp_path / log), "--config", str(tmp_path / "config.yaml"), "--out", str(out)]
+        assert main(arguments) == 0
+        results.append([(out / name).read_bytes() for name in ("regions.json", "estimates.csv", "config.yaml")])
+    assert results[0] == results[1] == results[2]
+
+    capsys.readouterr()
+    assert main([*arguments, "--set", "bag.topics={/odom: ann}", "--set", "bag.radius={ann: 1}"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
 
 
 # What is refused, and how.

@@ -57,7 +57,7 @@ def test_truth_inside_for_a_whole_run(which: int, clipped: int) -> None:
 
 
 def test_row_errors_hold_at_the_corners_of_the_errors() -> None:
-    """Move the robot and a body by their bounds in 16 x 16 directions: no direction or slack changes by more than told."""
+    """Move the robot and a body by their bounds in 16 x 16 directions: nothing changes by more than told."""
     generator = torch.Generator().manual_seed(4)
     compass = [(math.cos(k * math.pi / 8), math.sin(k * math.pi / 8)) for k in range(16)]
     moves = torch.tensor(list(itertools.product(compass, compass)), dtype=torch.float64)

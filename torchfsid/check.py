@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchfsid.consistency import Block, Consistency
+from torchfsid.consistency import Consistency
 from torchfsid.feasible_set import FeasibleSet
 from torchfsid.results import constraint_name
 from torchfsid.scene import AUTO_FACTOR, Scene
@@ -131,8 +131,13 @@ class Check:
         line = f"the log is consistent with the declared model for velocity >= {self.smallest_bound:.3g} m/s ({share})"
         if self.is_auto:
             return f"{line}; auto takes {self.declared:.3g}"
+        line = f"{line}; declared {self.declared:.3g}"
         short = [robot.robot for robot in self.robots if robot.smallest_bound > self.declared]
-        return f"{line}; declared {self.declared:.3g}" + (f", too small for {', '.join(short)}" if short else "")
+        if short:
+            return f"{line}, too small for {', '.join(short)}"
+        if self.smallest_bound > self.declared / AUTO_FACTOR:
+            line += ", of which more than half is needed: an error of the model may have taken it"
+        return line
 
     def to_json(self) -> dict:
         """As `check.json` holds it: what is infinite is null."""

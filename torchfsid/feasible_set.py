@@ -20,7 +20,7 @@ from torch import Tensor
 from torchfsid.clipping import Outcome, clip, merge
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import ROUND_OFF, Halfspaces
-from torchfsid.polygon import PRIOR, Polygon
+from torchfsid.polygon import Polygon
 from torchfsid.polytope import Polytope, clip_polytope, merge_polytope
 
 MAX_FACETS = 32
