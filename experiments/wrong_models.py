@@ -1,4 +1,4 @@
-"""What an observer says when its model is wrong: `python -m experiments.wrong_models` prints a table.
+"""What an observer says when its model is wrong. `python -m experiments.wrong_models` prints the table.
 
 Teams of four robots cross a disc with two pillars, one joint QP over each team (`neighbour_velocity: current`), with
 random goals. Controls are measured with errors of a given size, in random directions. Each model is wrong in one thing.

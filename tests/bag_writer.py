@@ -94,10 +94,11 @@ def write_bag(
     writer.set_compression(compression, CompressionFormat.ZSTD)
     with writer:
         for topic, of_topic in messages.items():
-            kind = type(of_topic[0]).__msgtype__  # type: ignore[attr-defined]
-            connection = writer.add_connection(topic, kind, typestore=STORE)
-            for k, message in enumerate(of_topic):
-                writer.write(connection, (1_000_000 + k) * 1_000_000_000, STORE.serialize_cdr(message, kind))
+            kinds: list[str] = [type(message).__msgtype__ for message in of_topic]  # type: ignore[attr-defined]
+            connections = {kind: writer.add_connection(topic, kind, typestore=STORE) for kind in dict.fromkeys(kinds)}
+            for k, (message, kind) in enumerate(zip(of_topic, kinds, strict=True)):
+                received = (1_000_000 + k) * 1_000_000_000
+                writer.write(connections[kind], received, STORE.serialize_cdr(message, kind))
     return folder
 
 

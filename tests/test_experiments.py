@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -26,6 +27,14 @@ CONFIGS = Path(__file__).parents[1] / "configs"
 SHORT = ("duration=0.2", "snapshots=[0.1]", "expected=[]")
 
 Runner = Callable[..., Results]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _shapes_are_checked_elsewhere() -> Iterator[None]:
+    """A run makes a hundred thousand checks, which would take longer than the run."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture(scope="module")

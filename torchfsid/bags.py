@@ -113,7 +113,10 @@ def _read(path: Path, bag: BagConfig) -> dict[str, list[_Sample]]:
     frames: set[str] = set()
     try:
         with Reader(path) as reader:
-            wanted = _wanted(path, {c.topic: c.msgtype for c in reader.connections}, bag)
+            types: dict[str, set[str]] = {connection.topic: set() for connection in reader.connections}
+            for connection in reader.connections:
+                types[connection.topic].add(connection.msgtype)
+            wanted = _wanted(path, types, bag)
             for connection, _, content in reader.messages([c for c in reader.connections if c.topic in wanted]):
                 message: Any = decode(content, connection.msgtype)
                 if connection.msgtype == TRANSFORMS:
@@ -141,14 +144,15 @@ def _read(path: Path, bag: BagConfig) -> dict[str, list[_Sample]]:
     return samples
 
 
-def _wanted(path: Path, types: dict[str, str], bag: BagConfig) -> set[str]:
+def _wanted(path: Path, types: dict[str, set[str]], bag: BagConfig) -> set[str]:
     """The topics to be read, all of them there and of the type that they must have."""
     expected = dict.fromkeys(bag.topics, (ODOMETRY, POSE)) | ({TF_TOPIC: (TRANSFORMS,)} if bag.frames else {})
     for topic, allowed in expected.items():
         if topic not in types:
             raise ConfigError(f"bag: {path}: no topic is called {topic!r}; there are {reprlib.repr(sorted(types))}")
-        if types[topic] not in allowed:
-            raise ConfigError(f"bag: {path}: topic {topic!r} is of type {types[topic]!r}, not {' or '.join(allowed)}")
+        if len(types[topic]) > 1 or types[topic].isdisjoint(allowed):
+            got = " and ".join(map(repr, sorted(types[topic])))
+            raise ConfigError(f"bag: {path}: topic {topic!r} is of type {got}, expected {' or '.join(allowed)}")
     return set(expected)
 
 
