@@ -335,6 +335,16 @@ def test_a_row_that_only_touches_is_undecided_and_not_made() -> None:
         assert not from_inside.shrunk
 
 
+def test_a_cut_before_the_empty_one_is_taken_back() -> None:
+    block = box(3, half=1.0)
+    after = cut(block, np.array([[1.0, 0, 0], [-1.0, 0, 0]]), np.array([-0.5, 0.2]), time=3.0)
+    assert after.outcome == Outcome.EMPTY
+    assert not after.shrunk
+    assert torch.equal(after.body.vertices, block.vertices)
+    assert sorted(after.contradiction.source[0].tolist()) == [PRIOR, PRIOR, 0, 1]
+    assert after.contradiction.time[0, :2].tolist() == [3.0, 3.0]
+
+
 def test_facets_of_which_only_an_edge_is_left_are_dropped() -> None:
     """A cube cut along the diagonal: two sides touch the prism that is left, and are redundant."""
     prism = cut(box(3, half=1.0), np.array([[1.0, 1, 0]]), np.zeros(1)).body
@@ -557,6 +567,7 @@ def test_a_batch_is_its_items_and_padding_is_harmless() -> None:
         assert torch.equal(body.nearest(q)[i], one.nearest(q[i : i + 1])[0])
         assert (body.A[i, int(body.count[i]) :] == 0).all()
         assert (body.b[i, int(body.count[i]) :] == 1).all()
+        assert (body.vertices[i, int(body.vertex_count[i]) :] == body.vertices[i, 0]).all()
     swapped = after.body.replaced(torch.tensor([2, 0]), after.body.select(torch.tensor([1, 2])))
     assert swapped.volume().tolist() == [after.body.volume()[i].item() for i in (2, 1, 1, 3)]
     rebuilt = Polytope(*(getattr(swapped, name) for name in Polytope.__dataclass_fields__))

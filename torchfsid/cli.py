@@ -204,6 +204,7 @@ def _print_verdicts(observation: Observation, out: Path) -> None:
     table.add_column("status", no_wrap=True)
     for verdict in observation.verdicts():
         since = verdict.no_information_since
+        resets = "".join(f", reset at {t:g} s" for t in verdict.resets)
         table.add_row(
             escape(verdict.robot),
             " ".join(f"{case}:{count}" for case, count in verdict.cases.items() if count),
@@ -214,7 +215,7 @@ def _print_verdicts(observation: Observation, out: Path) -> None:
             _vector(verdict.centre),
             f"{verdict.radius:.3g}",
             "never" if since is None else f"{since:g} s",
-            verdict.status if verdict.status == "ok" else f"[bold red]{verdict.status}[/]",
+            (verdict.status if verdict.status == "ok" else f"[bold red]{verdict.status}[/]") + resets,
         )
     console = _console()
     console.print(table)

@@ -25,7 +25,7 @@ from torchfsid.ukf import ParameterUkf
 @dataclass(frozen=True)
 class Verdict:
     """What a log says about one robot: `cases` counts the samples of each case; `no_information_since` is the time at
-    which the set last shrank [s], None if it never did."""
+    which the set last shrank [s], None if it never did; `resets` are the times of changes of its mind [s]."""
 
     robot: str
     cases: dict[str, int]
@@ -36,6 +36,7 @@ class Verdict:
     centre: tuple[float, ...]
     radius: float
     no_information_since: float | None
+    resets: tuple[float, ...]
     status: str
 
 
@@ -137,6 +138,7 @@ class Observation:
                 centre=tuple(centre[i].tolist()),
                 radius=float(radius[i]),
                 no_information_since=None if sets.last_cut[i].isnan() else float(sets.last_cut[i]),
+                resets=tuple(event.t for event in self.sets.events if event.robot == i and event.reset),
                 status=STATUS_NAMES[Status(int(self.sets.status[i]))],
             )
             for i, robot in enumerate(self.robots)

@@ -323,8 +323,7 @@ def _pyramids(y: Reals, incident: Mask) -> tuple[float, Reals, Reals]:
         if k == p:
             areas[facet] = volume[child]
         height, flat = y[apex[parent]] - y[base[child]], plane[child]
-        for _ in range(2):  # the second time takes out what round-off left
-            height = height - ((flat @ height[..., None]).transpose(0, 2, 1) @ flat)[:, 0]
+        height = height - ((flat @ height[..., None]).transpose(0, 2, 1) @ flat)[:, 0]
         length = np.linalg.norm(height, axis=1)
         pyramid = length * volume[child] / k
         volume = np.bincount(parent, pyramid, len(apex))

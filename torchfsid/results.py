@@ -147,6 +147,7 @@ def regions(robots: Sequence[str], observer: SetMembershipObserver) -> dict:
                 {
                     "t": event.t,
                     "status": STATUS_NAMES[event.status],
+                    "reset": event.reset,
                     "rows": [{"time": _or_none(time), "source": source} for time, source in event.rows],
                 }
                 for event in events

@@ -1,0 +1,176 @@
+"""`torchfsid check` and `noise.velocity: auto`: what a log says about its model without any truth."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from tests.logs import bounded_errors, write_config, write_log
+from torchfsid.barriers import ClassK, CollisionAvoidance
+from torchfsid.check import check
+from torchfsid.cli import main
+from torchfsid.config import ObserveConfig
+from torchfsid.consistency import RESOLUTION, SMALLEST
+from torchfsid.controller import CbfQpController
+from torchfsid.documents import validate
+from torchfsid.inverse_optimal import NoiseBound
+from torchfsid.logs import read_csv
+from torchfsid.observer import SetMembershipObserver, Status
+from torchfsid.scene import Scene
+from torchfsid.simulation import Trajectory, simulate
+from torchfsid.tasks import GoalTask, Saturation
+
+GOALS = {"ann": (2.0, 0.1), "bob": (-2.0, 0.0)}
+BODIES = [*GOALS, "pillar"]
+CONFIG = {
+    "task": {"kind": "goal", "gain": 0.9},
+    "barriers": [{"kind": "avoidance", "safety_distance": 0.5, "class_k": {"gain": 1.5}}],
+    "prior": {"lower": [-5, -5], "upper": [5, 5]},
+    "noise": {"velocity": 0.02},
+    "obstacles": ["pillar"],
+}
+
+
+def run_of(task: GoalTask) -> Trajectory:
+    start = torch.tensor([[-2.0, 0.0], [2.0, 0.3]], dtype=torch.float64)
+    controller = CbfQpController(task, [CollisionAvoidance(ClassK(1.5), safety_distance=0.5)])
+    goals = torch.tensor(list(GOALS.values()), dtype=torch.float64)
+    return simulate(controller, goals, start, dt=0.15, steps=24, obstacles=torch.tensor([[0.2, 1.0]]))
+
+
+@pytest.fixture(scope="module")
+def crossing() -> Trajectory:
+    """Two robots swap places past a pillar."""
+    return run_of(GoalTask(0.9))
+
+
+@pytest.fixture(scope="module")
+def noisy_log(crossing: Trajectory, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The crossing, with errors of 0.01 m/s in the velocities."""
+    return write_log(tmp_path_factory.mktemp("log") / "log.csv", crossing, BODIES, bounded_errors(crossing, 2, 0.01, 0))
+
+
+def scene_of(log: Path, **changes) -> Scene:
+    return Scene(validate({**CONFIG, **changes}, ObserveConfig, "test"), read_csv(log))
+
+
+def statuses(scene: Scene, bounds: torch.Tensor) -> list[int]:
+    """How an observer ends that reads the samples one by one."""
+    observer = SetMembershipObserver(scene.task, scene.barriers, scene.prior, noise=NoiseBound(bounds))
+    for sample in scene.measurements():
+        observer.update(sample)
+    return observer.status.tolist()
+
+
+def test_the_smallest_bound_is_where_an_observer_begins_to_contradict(noisy_log: Path) -> None:
+    scene = scene_of(noisy_log)
+    bounds = torch.tensor(list(scene.smallest_bounds().values()))
+    assert (bounds < 0.01 * RESOLUTION).all()
+    assert (bounds > 0.003).all()
+    assert statuses(scene, bounds * RESOLUTION) == [Status.OK, Status.OK]
+    assert min(statuses(scene, bounds / RESOLUTION**2)) > Status.OK
+
+
+def test_with_a_clipped_nominal_control_too(tmp_path: Path) -> None:
+    run = run_of(GoalTask(0.9, saturation=Saturation("norm", (0.8, 0.8))))
+    log = write_log(tmp_path / "log.csv", run, BODIES, bounded_errors(run, 2, 0.01, 1))
+    task = {"kind": "goal", "gain": 0.9, "saturation": {"kind": "norm", "limit": 0.8}}
+    scene = scene_of(log, task=task)
+    bounds = torch.tensor(list(scene.smallest_bounds().values()))
+    assert (bounds < 0.01 * RESOLUTION).all()
+    assert statuses(scene, bounds * RESOLUTION) == [Status.OK, Status.OK]
+    assert max(scene_of(log).smallest_bounds().values()) > 0.1
+
+
+def test_observe_finds_the_bound_uses_twice_that_and_can_be_repeated(
+    noisy_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = write_config(tmp_path / "config.yaml", {**CONFIG, "noise": {"velocity": "auto", "position": 1e-4}})
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert main(["observe", str(noisy_log), "--config", str(config), "--out", str(first)]) == 0
+    assert "auto found 0.00" in capsys.readouterr().out
+    found = json.loads((first / "velocity_bound.json").read_text())
+    used = yaml.safe_load((first / "config.yaml").read_text())["noise"]["velocity"]
+    assert used == found["used"] == 2 * max(found["smallest"].values())
+    assert set(found["smallest"]) == set(GOALS)
+    regions = json.loads((first / "regions.json").read_text())["robots"]
+    for robot, goal in GOALS.items():
+        assert regions[robot]["status"] == "ok"
+        for a, b in zip(regions[robot]["A"], regions[robot]["b"], strict=True):
+            assert a[0] * goal[0] + a[1] * goal[1] <= b + 1e-9
+    assert main(["observe", str(noisy_log), "--config", str(first / "config.yaml"), "--out", str(second)]) == 0
+    assert (first / "regions.json").read_bytes() == (second / "regions.json").read_bytes()
+    assert not (second / "velocity_bound.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ("prior={lower: [40, 40], upper: [45, 45]}", "'ann'"),
+        ("on_inconsistent=reset", "noise"),
+        ("noise.velocity=automatic", "noise.velocity: expected a bound of at least 0 m/s or 'auto'"),
+    ],
+)
+def test_no_bound_is_one_line_and_exit_code_2(
+    noisy_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], change: str, expected: str
+) -> None:
+    config = write_config(tmp_path / "config.yaml", {**CONFIG, "noise": {"velocity": "auto"}})
+    out = tmp_path / "out"
+    assert main(["observe", str(noisy_log), "--config", str(config), "--out", str(out), "--set", change]) == 2
+    error = capsys.readouterr().err
+    assert expected in error
+    assert error.count("\n") == 1
+    assert not out.exists()
+
+
+def test_an_exact_log_of_the_declared_model(crossing: Trajectory, tmp_path: Path) -> None:
+    found = check(scene_of(write_log(tmp_path / "log.csv", crossing, BODIES)))
+    assert found.smallest_bound == SMALLEST
+    assert found.best_shift == 0
+    assert all(robot.worst <= SMALLEST * RESOLUTION for robot in found.robots)
+    assert not any(robot.contradictions or robot.violations for robot in found.robots)
+    assert found.conclusions()[0].startswith("the log is consistent with the declared model for velocity >= 1e-09 m/s")
+
+
+@pytest.mark.parametrize("shift", [-1, 1])
+def test_a_shift_between_positions_and_velocities_is_found(crossing: Trajectory, tmp_path: Path, shift: int) -> None:
+    """`shift` > 0: a velocity is logged that many samples too late."""
+    samples = torch.arange(len(crossing.t))
+    late = replace(crossing, u=crossing.u[(samples - shift).clamp(0, len(samples) - 1)])
+    found = check(scene_of(write_log(tmp_path / "log.csv", late, BODIES)))
+    assert found.best_shift == shift
+    assert f"velocities logged 1 sample(s) {'later' if shift > 0 else 'earlier'} fit better" in found.conclusions()[1]
+
+
+def test_check_blames_the_wrong_row(noisy_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The declared distance is too large: rows are violated. Then too small: robots turn away too early."""
+    config = write_config(tmp_path / "config.yaml", CONFIG)
+    command = ["check", str(noisy_log), "--config", str(config), "--out", str(tmp_path)]
+    assert main([*command, "--set", "barriers.0.safety_distance=0.6"]) == 0
+    text = capsys.readouterr().out
+    assert "samples that violate a hard row at 0.02 m/s" in text
+    robots = json.loads((tmp_path / "check.json").read_text())["robots"]
+    rows = {fault["row"] for robot in robots.values() for fault in robot["violations"]}
+    assert rows <= {"avoid ann", "avoid bob", "avoid pillar"}
+    assert rows
+    assert all(fault["worst"] > 0 for robot in robots.values() for fault in robot["violations"])
+
+    assert main([*command, "--set", "barriers.0.safety_distance=0.3"]) == 0
+    found = json.loads((tmp_path / "check.json").read_text())
+    assert "too small for ann, bob" in found["conclusions"][0]
+    assert found["smallest_bound"] > 0.02
+    contradictions = [fault for robot in found["robots"].values() for fault in robot["contradictions"]]
+    assert sum(fault["samples"] for fault in contradictions) > 5
+    assert {"nominal control"} < {fault["row"] for fault in contradictions} | {"avoid ann"}
+
+
+def test_check_answers_mistakes_with_one_line(
+    noisy_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = write_config(tmp_path / "config.yaml", CONFIG)
+    assert main(["check", str(noisy_log), "--config", str(config), "--set", "task.gain=0"]) == 2
+    assert main(["check", str(tmp_path / "no.csv"), "--config", str(config)]) == 2
+    assert capsys.readouterr().err.count("\n") == 2
