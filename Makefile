@@ -25,7 +25,7 @@ demo: $(STAMP)
 	@echo "Figures and results are in $(DEMO_OUT)/:" && ls $(DEMO_OUT)
 
 test: lint
-	$(BIN)/pytest -n 2
+	$(BIN)/pytest -n 2 --dist loadfile
 
 lint: $(STAMP)
 	$(BIN)/ruff check

@@ -82,7 +82,6 @@ def test_with_a_clipped_nominal_control_too(tmp_path: Path) -> None:
     bounds = torch.tensor(list(scene.smallest_bounds().values()))
     assert (bounds < 0.01 * RESOLUTION).all()
     assert statuses(scene, bounds * RESOLUTION) == [Status.OK, Status.OK]
-    assert max(scene_of(log).smallest_bounds().values()) > 0.1
 
 
 def test_observe_finds_the_bound_uses_twice_that_and_can_be_repeated(
@@ -135,36 +134,33 @@ def test_an_exact_log_of_the_declared_model(crossing: Trajectory, tmp_path: Path
     assert found.conclusions()[0].startswith("the log is consistent with the declared model for velocity >= 1e-09 m/s")
 
 
-@pytest.mark.parametrize("shift", [-1, 1])
-def test_a_shift_between_positions_and_velocities_is_found(crossing: Trajectory, tmp_path: Path, shift: int) -> None:
-    """`shift` > 0: a velocity is logged that many samples too late."""
-    samples = torch.arange(len(crossing.t))
-    late = replace(crossing, u=crossing.u[(samples - shift).clamp(0, len(samples) - 1)])
+def test_a_shift_between_positions_and_velocities_is_found(crossing: Trajectory, tmp_path: Path) -> None:
+    """Velocities are logged one sample too late."""
+    late = replace(crossing, u=torch.cat([crossing.u[:1], crossing.u[:-1]]))
     found = check(scene_of(write_log(tmp_path / "log.csv", late, BODIES)))
-    assert found.best_shift == shift
-    assert f"velocities logged 1 sample(s) {'later' if shift > 0 else 'earlier'} fit better" in found.conclusions()[1]
+    assert found.best_shift == 1
+    assert "velocities logged 1 sample(s) later fit better" in found.conclusions()[1]
 
 
-def test_check_blames_the_wrong_row(noisy_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The declared distance is too large: rows are violated. Then too small: robots turn away too early."""
+def test_check_names_the_rows_of_a_wrong_model(
+    noisy_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The declared distance is too large: rows are violated, and what is left makes no sense either."""
     config = write_config(tmp_path / "config.yaml", CONFIG)
     command = ["check", str(noisy_log), "--config", str(config), "--out", str(tmp_path)]
-    assert main([*command, "--set", "barriers.0.safety_distance=0.6"]) == 0
+    assert main([*command, "--set", "barriers.0.safety_distance=0.7"]) == 0
     text = capsys.readouterr().out
-    assert "samples that violate a hard row at 0.02 m/s" in text
-    robots = json.loads((tmp_path / "check.json").read_text())["robots"]
-    rows = {fault["row"] for robot in robots.values() for fault in robot["violations"]}
-    assert rows <= {"avoid ann", "avoid bob", "avoid pillar"}
-    assert rows
-    assert all(fault["worst"] > 0 for robot in robots.values() for fault in robot["violations"])
-
-    assert main([*command, "--set", "barriers.0.safety_distance=0.3"]) == 0
     found = json.loads((tmp_path / "check.json").read_text())
-    assert "too small for ann, bob" in found["conclusions"][0]
     assert found["smallest_bound"] > 0.02
-    contradictions = [fault for robot in found["robots"].values() for fault in robot["contradictions"]]
-    assert sum(fault["samples"] for fault in contradictions) > 5
-    assert {"nominal control"} < {fault["row"] for fault in contradictions} | {"avoid ann"}
+    assert "declared 0.02, too small for ann, bob" in found["conclusions"][0]
+    assert "samples that violate a hard row at 0.02 m/s" in text
+    for robot, other in (("ann", "bob"), ("bob", "ann")):
+        violations = found["robots"][robot]["violations"]
+        assert {f"avoid {other}"} <= {fault["row"] for fault in violations} <= {f"avoid {other}", "avoid pillar"}
+        assert all(fault["worst"] > 0 and not fault["soft"] for fault in violations)
+        contradictions = found["robots"][robot]["contradictions"]
+        assert {fault["row"] for fault in contradictions} <= {f"avoid {other}", "avoid pillar", "nominal control"}
+        assert all(0 <= fault["first"] <= 3.6 and fault["worst"] > 0 for fault in contradictions)
 
 
 def test_check_answers_mistakes_with_one_line(

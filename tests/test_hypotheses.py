@@ -61,16 +61,15 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     task = AffineTask(each_its_own(0), each_its_own(1), ("theta_0", "theta_1"))
     start = torch.tensor([[1.3, -0.2], [-1.5, -0.6], [1.5, -1.0]], dtype=torch.float64)
     truths = torch.tensor(list(TRUTHS.values()), dtype=torch.float64)
-    run = simulate(CbfQpController(task, [AVOIDANCE]), truths, start, dt=0.1, steps=30)
+    run = simulate(CbfQpController(task, [AVOIDANCE]), truths, start, dt=0.15, steps=20)
     assert run.active.any()
     return write_log(tmp_path_factory.mktemp("log") / "log.csv", run, BODIES, bounded_errors(run, 3, 0.01, 0))
 
 
-@pytest.mark.parametrize("velocity", [0.01, "auto"])
 def test_each_robot_is_identified_by_refuting_the_others(
-    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], velocity: float | str
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    noise = {"velocity": velocity, "neighbour_velocity": 0.01}
+    noise = {"velocity": "auto", "neighbour_velocity": 0.01}
     config = write_config(tmp_path / "config.yaml", {**CONFIG, "noise": noise})
     out = tmp_path / "out"
     assert main(["observe", str(log), "--config", str(config), "--out", str(out)]) == 0
@@ -95,16 +94,11 @@ def test_each_robot_is_identified_by_refuting_the_others(
             rows = {evidence["row"] for evidence in refuted["evidence"]}
             assert rows <= {"prior", "nominal control", *(f"avoid {other}" for other in BODIES)}
     assert {path.name for path in (out / "velocity").iterdir()} >= {"estimates.csv", "regions.json", "config.yaml"}
-    assert (out / "velocity_bound.json").exists() == (velocity == "auto")
-
-
-def test_one_hypothesis_can_be_run_again_from_its_folder(log: Path, tmp_path: Path) -> None:
-    config = write_config(tmp_path / "config.yaml", CONFIG)
-    assert main(["observe", str(log), "--config", str(config), "--out", str(tmp_path / "all")]) == 0
-    alone = tmp_path / "all" / "home" / "config.yaml"
-    assert main(["observe", str(log), "--config", str(alone), "--out", str(tmp_path / "one")]) == 0
-    regions = [tmp_path / folder / "regions.json" for folder in ("all/home", "one")]
-    assert regions[0].read_bytes() == regions[1].read_bytes()
+    found = json.loads((out / "velocity_bound.json").read_text())
+    assert found["used"] == 2 * max(found["smallest"].values()) <= 0.0204
+    again = tmp_path / "again"
+    assert main(["observe", str(log), "--config", str(out / "home" / "config.yaml"), "--out", str(again)]) == 0
+    assert (again / "regions.json").read_bytes() == (out / "home" / "regions.json").read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -131,8 +125,8 @@ def test_wrong_hypotheses_are_one_line(tmp_path: Path, change: dict, expected: s
 
 @pytest.mark.parametrize("noise", [1e-6, 0.01])
 def test_a_change_of_goal_is_seen_within_two_samples(noise: float) -> None:
-    """Ten pairs of robots change their goals half-way to them, by at least half a metre; the sets start again."""
-    pairs, dt = 10, 0.05
+    """Four pairs of robots change their goals half-way to them, by at least half a metre; the sets start again."""
+    pairs, dt = 4, 0.08
     generator = torch.Generator().manual_seed(3)
     goals = 4 * torch.rand(2, 2 * pairs, 2, generator=generator, dtype=torch.float64) - 2
     apart = goals[1] - goals[0]
@@ -141,7 +135,7 @@ def test_a_change_of_goal_is_seen_within_two_samples(noise: float) -> None:
     start[1::2] = start[::2] + torch.tensor([0.8, 0.0])
     samples: list[Measurement] = []
     controller = CbfQpController(GoalTask(0.9), [AVOIDANCE])
-    switch = 30
+    switch = 18
     for pair in range(pairs):
         own = slice(2 * pair, 2 * pair + 2)
         before = simulate(controller, goals[0, own], start[own], dt=dt, steps=switch)
@@ -169,15 +163,13 @@ def test_a_change_of_goal_is_seen_within_two_samples(noise: float) -> None:
     assert sorted(event.robot for event in observer.events) == list(range(2 * pairs))
     assert all(event.reset for event in observer.events)
     delays = [round(event.t / dt) - switch for event in observer.events]
-    assert 0 <= min(delays)
+    assert min(delays) >= 0
     assert max(delays) <= 2
 
 
 def beside(one: Measurement, other: Measurement) -> Measurement:
     """Two teams as one batch."""
     joined = {
-        name: torch.cat([value, getattr(other, name)])
-        for name, value in vars(one).items()
-        if isinstance(value, Tensor)
+        name: torch.cat([value, getattr(other, name)]) for name, value in vars(one).items() if isinstance(value, Tensor)
     }
     return replace(one, **joined)
