@@ -186,7 +186,9 @@ def prior(goals: Tensor) -> FeasibleSet:
 def automatic(model: Model, samples: list[Measurement], goals: Tensor, neighbour_velocity: float) -> NoiseBound:
     """What `velocity: auto` takes for each run, for all its robots."""
     consistency = Consistency(samples, model.task, model.barriers, prior(goals), neighbour_velocity=neighbour_velocity)
-    smallest = consistency.smallest_bounds(10 * consistency.fastest).unflatten(0, (-1, ROBOTS)).amax(-1)
+    smallest = consistency.smallest_bounds(consistency.fastest).unflatten(0, (-1, ROBOTS)).amax(-1)
+    # Where there is no such bound the command ends with an error, which is as good as a flag: take what is refuted.
+    smallest = torch.where(smallest.isfinite(), smallest, 0.0)
     return NoiseBound(AUTO_FACTOR * smallest.repeat_interleave(ROBOTS), neighbour_velocity=neighbour_velocity)
 
 

@@ -55,7 +55,7 @@ def load(path: str | Path, model: type[Config], overrides: Iterable[str] = ()) -
 def dump(config: Strict) -> str:
     """The configuration with its defaults filled in, as YAML that loads back to the same configuration."""
     content = config.model_dump(mode="json", exclude_none=True)
-    return yaml.safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None)
+    return yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
 
 
 def read_yaml(path: str | Path) -> dict[Any, Any]:
