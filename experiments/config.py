@@ -15,7 +15,6 @@ from pydantic import Field, model_validator
 from torchfsid.config import (
     AvoidanceConfig,
     BarrierConfig,
-    GoalConfig,
     NoiseConfig,
     PriorConfig,
     UkfConfig,
@@ -23,6 +22,7 @@ from torchfsid.config import (
 from torchfsid.documents import Strict, apply_overrides, read_yaml, validate, wrong
 from torchfsid.errors import ConfigError
 from torchfsid.quantities import BodyName, NonNegative, Number, PlanarVector, Positive
+from torchfsid.task_config import GoalConfig
 
 MAX_STEPS = 1_000_000
 """More is a slip of the pen in dt or duration."""

@@ -12,10 +12,11 @@ from hypothesis import strategies as st
 
 from torchfsid.active_set import ACTIVE_TOLERANCE
 from torchfsid.barriers import Arena, ClassK, CollisionAvoidance, SpeedBox, SpeedPolygon
-from torchfsid.config import BarrierConfig, ObserveConfig, PriorConfig, TaskConfig
+from torchfsid.config import BarrierConfig, ObserveConfig, PriorConfig
 from torchfsid.documents import Strict, apply_overrides, dump, load, read_yaml, validate
 from torchfsid.errors import ConfigError
 from torchfsid.inverse_optimal import NoiseBound
+from torchfsid.task_config import TaskConfig
 from torchfsid.tasks import FormationTask, GoalTask, OrbitTask, PatrolTask, UnknownGainGoalTask, VelocityTask
 
 IRSIM = """

@@ -8,7 +8,6 @@ Nothing here imports torch before something is built, so that a wrong file is re
 
 from __future__ import annotations
 
-import math
 import reprlib
 import sys
 from collections.abc import Sequence
@@ -19,12 +18,12 @@ from pydantic import Field, field_validator, model_validator
 from torchfsid.bags import BagConfig
 from torchfsid.documents import Strict, wrong
 from torchfsid.errors import ConfigError
-from torchfsid.quantities import BodyName, Flag, NonNegative, Number, PlanarVector, Positive, Vector, as_number
+from torchfsid.quantities import BodyName, Flag, NonNegative, PlanarVector, Positive, Vector, as_number
+from torchfsid.task_config import TaskConfig, require_body
 
 if TYPE_CHECKING:
     from torchfsid.barriers import Barrier
     from torchfsid.inverse_optimal import NoiseBound
-    from torchfsid.tasks import Task
 
 
 class ClassKConfig(Strict):

@@ -17,9 +17,10 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from torchfsid.config import ObserveConfig, PriorConfig, TaskConfig
+from torchfsid.config import ObserveConfig, PriorConfig
 from torchfsid.documents import Strict, apply_overrides, read_yaml, validate, wrong
 from torchfsid.errors import ConfigError
+from torchfsid.task_config import TaskConfig
 
 
 class HypothesisConfig(Strict):
