@@ -30,9 +30,9 @@ from torchfsid.tasks import Task
 OPTIMAL, INFEASIBLE = 1, -1
 """Exit flags of daqp; all others are failures of the solver."""
 
-DAQP_TOLERANCES = {"primal_tol": 1e-12, "zero_tol": 1e-14, "sing_tol": 1e-12}
+DAQP_TOLERANCES = {"primal_tol": 1e-12, "zero_tol": 1e-14, "sing_tol": 1e-14}
 """Relative to the speeds of the problem. `sing_tol` is the square of the angle [rad] below which daqp takes rows for
-parallel: its default calls every wedge thinner than 6e-6 rad infeasible. This one is 1e-6 rad, like
+parallel: its default calls every wedge thinner than 6e-6 rad infeasible. This one is 1e-7 rad, like
 `kkt.RANK_TOLERANCE`, so that the rows daqp tells apart are apart for `solve_kkt` too."""
 
 

@@ -29,8 +29,8 @@ from torchfsid.halfspaces import Halfspaces
 CASES = "ABCDE"
 """Table I of the paper: A none active; B one; C several, rank 1; D two, rank 2; E three or more, rank 2."""
 
-RANK_TOLERANCE = 1e-6
-"""Unit rows closer to parallel than this [rad] count as parallel."""
+RANK_TOLERANCE = 1e-7
+"""Relative singular value: unit rows less than twice this apart [rad] count as parallel. Below it round-off decides."""
 
 ANGLE_TOLERANCE = 1e-12
 """Round-off allowed when an angular gap is compared with 180 degrees [rad]."""
