@@ -163,6 +163,19 @@ def test_check_names_the_rows_of_a_wrong_model(
         assert all(0 <= fault["first"] <= 3.6 and fault["worst"] > 0 for fault in contradictions)
 
 
+def test_observe_says_when_a_generous_bound_is_used_up(
+    noisy_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A gain that is wrong by 5 % hides in a bound of 0.06 m/s; the right one needs a sixth of it."""
+    config = write_config(tmp_path / "config.yaml", {**CONFIG, "noise": {"velocity": 0.06}})
+    command = ["observe", str(noisy_log), "--config", str(config), "--out", str(tmp_path / "out")]
+    for gain, strained in ((0.9, False), (0.945, True)):
+        assert main([*command, "--set", f"task.gain={gain}"]) == 0
+        text = capsys.readouterr().out
+        assert "inconsistent" not in text
+        assert ("More than half of noise.velocity, 0.06 m/s, is needed by ann, bob" in text) == strained
+
+
 def test_check_answers_mistakes_with_one_line(
     noisy_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

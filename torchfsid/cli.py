@@ -220,6 +220,11 @@ def _print_verdicts(observation: Observation, out: Path) -> None:
     console = _console()
     console.print(table)
     _print_bound(console, observation.smallest_bounds, observation.velocity_bound)
+    if strained := observation.strained():
+        console.print(
+            f"More than half of noise.velocity, {observation.velocity_bound:g} m/s, is needed by "
+            f"{escape(', '.join(strained))}: if the errors are not that large, the model is wrong (torchfsid check)"
+        )
     console.print(f"Results: {out}/estimates.csv, regions.json, config.yaml, regions.png, regions.pdf")
 
 

@@ -104,6 +104,22 @@ class Observation:
         assert self.config.noise.velocity != "auto"
         return self.config.noise.velocity
 
+    def strained(self) -> list[str]:
+        """Robots that ended ok but need more than half of the velocity bound: an error of the model may have taken it.
+
+        No alarm, since errors may be as large as declared. Not asked where it means nothing (the bound was found, sets
+        start again, the paper's set) or takes too long (theta is not planar).
+        """
+        config, sets = self.config, self.sets
+        if self.smallest_bounds is not None or config.on_inconsistent == "reset" or sets.kind == "critical_region":
+            return []
+        if sets.prior.dim != 2:
+            return []
+        half = torch.full((len(self.robots),), self.velocity_bound / AUTO_FACTOR, dtype=torch.float64)
+        _, suffices = self.scene.consistency().sets(half)
+        needs_more = (sets.status == Status.OK) & ~suffices
+        return [robot for robot, strained in zip(self.robots, needs_more.tolist(), strict=True) if strained]
+
     def run(self, out: Path) -> Iterator[float]:
         """Observe the whole log into the folder `out`, yielding the time of each sample done; the figure comes last."""
         with ResultsWriter(out, self.robots, self.sets) as results:
