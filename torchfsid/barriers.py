@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchfsid.errors import InputError
@@ -188,7 +188,8 @@ class SpeedBox:
 
 @dataclass(frozen=True)
 class SpeedPolygon:
-    """u inside a regular polygon with a vertex on the first axis, whose circumradius is `limit` [m/s]."""
+    """u inside a regular polygon of circumradius `limit` [m/s], its first side across the first axis: the usual
+    approximation of |u| <= limit by u_1 <= limit cos(pi/sides) and its rotations (Robotarium's, with 8 sides)."""
 
     sides: int
     limit: float
@@ -199,7 +200,7 @@ class SpeedPolygon:
             raise InputError("speed_polygon", "sides >= 3 and limit > 0", (self.sides, self.limit))
 
     def __call__(self, measurement: Measurement) -> Halfspaces:
-        angles = (2 * torch.arange(self.sides, dtype=torch.float64) + 1) * (math.pi / self.sides)
+        angles = torch.arange(self.sides, dtype=torch.float64) * (2 * math.pi / self.sides)
         normals = torch.stack([angles.cos(), angles.sin()], dim=-1)
         apothem = self.limit * math.cos(math.pi / self.sides)
         return _constant(normals, torch.full((self.sides,), apothem, dtype=torch.float64), measurement)
@@ -241,6 +242,28 @@ class Arena:
         to_upper = torch.tensor(self.upper, dtype=torch.float64) - self.margin - x
         to_lower = x - torch.tensor(self.lower, dtype=torch.float64) - self.margin
         return torch.cat([to_upper, to_lower], dim=-1)
+
+
+def is_joint(barriers: Sequence[Barrier]) -> bool:
+    """Does one QP decide for the whole team, since some rows count the neighbours' current velocities?"""
+    return any(isinstance(b, CollisionAvoidance) and b.neighbour_velocity == "current" for b in barriers)
+
+
+def controller_failed(
+    barriers: Sequence[Barrier], measurement: Measurement, slack: Float[Tensor, "*batch m"]
+) -> Bool[Tensor, "*batch"]:
+    """Has the controller of each robot found no solution? Then it commands exactly zero, which says nothing.
+
+    A robot's own QP has failed if zero violates one of its rows: `slack` is that of its control [m/s]. A joint QP stops
+    the whole team, whichever pair is at odds, so it may have failed whenever nobody moves.
+    """
+    assert measurement.u is not None
+    stopped = (measurement.u == 0).all(-1)
+    failed = stopped & (slack < 0).any(-1)
+    if is_joint(barriers) and measurement.body_velocities is not None:
+        others_move = (measurement.present & (measurement.body_velocities != 0).any(-1)).any(-1)
+        failed = failed | (stopped & ~others_move)
+    return failed
 
 
 def _constant(A: Tensor, b: Tensor, measurement: Measurement) -> Halfspaces:

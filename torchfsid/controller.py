@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchfsid.barriers import Barrier, CollisionAvoidance
+from torchfsid.barriers import Barrier, is_joint
 from torchfsid.errors import InputError, SolverError
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.kkt import solve_kkt
@@ -161,7 +161,7 @@ class CbfQpController:
             uhat = uhat if self.task.saturation is None else self.task.saturation(uhat)
         except RuntimeError as error:
             raise InputError("theta", f"a batch that fits {tuple(d.shape[:-1])}", tuple(theta.shape)) from error
-        if measurement.body_velocities is None and any(map(_counts_current_velocities, self.barriers)):
+        if measurement.body_velocities is None and is_joint(self.barriers):
             return self._team_control(measurement, uhat)
         safe_controls = Halfspaces.stack([barrier(measurement) for barrier in self.barriers])
         return _control(safe_controls, uhat)
@@ -179,7 +179,7 @@ class CbfQpController:
         blocks, pair_columns, column = [], [], 0
         for barrier, part in zip(self.barriers, parts, strict=True):
             share = own.expand(robots, part.rows, robots)
-            if _counts_current_velocities(barrier):
+            if is_joint([barrier]):
                 share = share - torch.eye(part.rows, robots, dtype=torch.float64, device=uhat.device)
                 pair_columns.append(slice(column, column + robots))
             blocks.append((share.unsqueeze(-1) * part.A.unsqueeze(-2)).flatten(-2))
@@ -192,10 +192,6 @@ class CbfQpController:
             of_pairs = active[:, columns]
             active[:, columns] = of_pairs | of_pairs.T
         return Control(control.u.reshape(robots, n), uhat, active, control.feasible.expand(robots))
-
-
-def _counts_current_velocities(barrier: Barrier) -> bool:
-    return isinstance(barrier, CollisionAvoidance) and barrier.neighbour_velocity == "current"
 
 
 def _control(safe_controls: Halfspaces, uhat: Tensor) -> Control:

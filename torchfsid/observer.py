@@ -5,11 +5,10 @@ shows which rows are active, the KKT conditions become half-spaces, and Theta(t)
 
 What can go wrong with data is reported, never hidden in the set:
     - an empty intersection: the set stays as it was and the robot's status becomes INCONSISTENT, or, if it is known
-    that
-      robots change their minds, the set starts again from the prior;
+      that robots change their minds, the set starts again from the prior;
     - a hard row violated by more than its bound: model or bounds are wrong, the sample is not used, status ALARM;
-    - a controller that failed (it commands exactly zero while a row is violated), a robot or a neighbour's velocity not
-      measured: the sample says nothing, it is skipped and counted.
+    - a controller that failed (it commands exactly zero, see `controller_failed`), a robot or a neighbour's velocity
+      not measured: the sample says nothing, it is skipped and counted.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchfsid.active_set import ACTIVE_TOLERANCE, active_set
-from torchfsid.barriers import Barrier
+from torchfsid.barriers import Barrier, controller_failed
 from torchfsid.critical_region import critical_region
 from torchfsid.errors import InconsistentError, InputError
 from torchfsid.feasible_set import FeasibleSet
@@ -119,8 +118,7 @@ class SetMembershipObserver:
         noise: bounds for `inverse_optimal` and for the alarm.
         active_tolerance: when a row counts as active for `critical_region`, for the case label and for (G, f) [m/s].
         on_inconsistent: what an empty intersection does: `hold` the set as it was, `reset` it to the prior and go on
-        from
-            there (a change of goal; the status stays OK, the event is recorded), or `raise` an `InconsistentError`.
+            from there (a change of goal; the status stays OK, the event is recorded), or `raise` an `InconsistentError`.
         status, skipped, events: per robot: `Status`, number of samples without information, first ALARM and
         INCONSISTENT.
 
@@ -195,8 +193,7 @@ class SetMembershipObserver:
         if uncertainty is not None:
             bound = bound + uncertainty.slack
         excess = -slack - bound - safe_controls.round_off(u)
-        failed = (u == 0).all(-1) & (slack < 0).any(-1)
-        measured = evaluated.all(-1) & wish_known & ~failed
+        measured = evaluated.all(-1) & wish_known & ~controller_failed(self.barriers, measurement, slack)
         if measurement.observed is not None:
             measured = measured & measurement.observed
         alarmed = measured & ((excess > 0) & hard).any(-1)

@@ -31,7 +31,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchfsid.active_set import ACTIVE_TOLERANCE, active_set
-from torchfsid.barriers import Barrier, stack_barriers
+from torchfsid.barriers import Barrier, controller_failed, stack_barriers
 from torchfsid.controller import solve_safe_qp
 from torchfsid.errors import InputError, SolverError
 from torchfsid.halfspaces import Halfspaces
@@ -209,7 +209,7 @@ class ParameterUkf:
         d = torch.where(known[:, None], d, 0.0).to(torch.float64)
         u = torch.where(known[:, None], measurement.u, 0.0).to(torch.float64)
         slack = safe_controls.slack(u)
-        failed = (u == 0).all(-1) & (slack < 0).any(-1)
+        failed = controller_failed(self.barriers, measurement, slack)
         known = (known & ~failed & (slack >= -self.active_tolerance).all(-1)).tolist()
         clip = self.task.saturation
         if self.qp_inside:

@@ -1,0 +1,62 @@
+"""The rows that need no neighbour, against how others write them; and controllers that fail."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from scipy.spatial import HalfspaceIntersection
+
+from torchfsid import CollisionAvoidance, FeasibleSet, GoalTask, NoiseBound, SetMembershipObserver
+from torchfsid.barriers import Arena, ClassK, SpeedPolygon
+from torchfsid.measurement import Measurement
+
+AT_REST = Measurement.of_team(0.0, torch.zeros(1, 2), torch.zeros(1, 2))
+
+
+def test_the_speed_polygon_is_the_usual_inner_approximation_of_the_disc() -> None:
+    """u_x, (u_x + u_y)/sqrt 2, u_y ... <= v cos(pi/8), as the Robotarium writes its eight rows."""
+    rows = SpeedPolygon(8, 0.2)(AT_REST)
+    apothem, half = 0.2 * math.cos(math.pi / 8), math.sqrt(0.5)
+    normals = [[1, 0], [half, half], [0, 1], [-half, half], [-1, 0], [-half, -half], [0, -1], [half, -half]]
+    torch.testing.assert_close(rows.A[0], torch.tensor(normals, dtype=torch.float64), rtol=0, atol=1e-15)
+    torch.testing.assert_close(rows.b[0], torch.full((8,), apothem, dtype=torch.float64), rtol=0, atol=1e-15)
+
+
+def test_corners_of_a_speed_polygon_lie_on_the_circle() -> None:
+    for sides in (3, 4, 5, 8):
+        rows = SpeedPolygon(sides, 0.7)(AT_REST)
+        halfspaces = np.concatenate([rows.A[0].numpy(), -rows.b[0].numpy()[:, None]], axis=1)
+        corners = np.unique(HalfspaceIntersection(halfspaces, np.zeros(2)).intersections.round(9), axis=0)
+        assert len(corners) == sides
+        np.testing.assert_allclose(np.linalg.norm(corners, axis=1), 0.7, atol=1e-8)
+
+
+def test_walls_slow_a_robot_down() -> None:
+    """alpha(distance to the wall beyond the margin), on each side."""
+    x = torch.tensor([[1.2, -0.4]], dtype=torch.float64)
+    rows = Arena((-1.6, -1.0), (1.6, 1.0), ClassK(40.0, 3), margin=0.075)(Measurement.of_team(0.0, x))
+    expected = {(1, 0): 1.6 - 1.2, (0, 1): 1.0 + 0.4, (-1, 0): 1.2 + 1.6, (0, -1): -0.4 + 1.0}
+    for normal, b in zip(rows.A[0].tolist(), rows.b[0].tolist(), strict=True):
+        assert math.isclose(b, 40.0 * (expected[int(normal[0]), int(normal[1])] - 0.075) ** 3, rel_tol=1e-12)
+
+
+def test_a_team_whose_joint_controller_failed_says_nothing() -> None:
+    """Robots 0 and 1 are too close: there is no joint solution, so robot 2, far away, is stopped too."""
+    goals = torch.tensor([[3.0, 0.0], [-3.0, 0.0], [0.0, 4.0]], dtype=torch.float64)
+    x = torch.tensor([[0.0, 0.0], [0.1, 0.0], [4.0, 4.0]], dtype=torch.float64)
+    prior = FeasibleSet.from_box(torch.full((3, 2), -5.0), torch.full((3, 2), 5.0))
+    team = CollisionAvoidance(ClassK(1.0), safety_distance=0.5, neighbour_velocity="current")
+    watching = SetMembershipObserver(GoalTask(1.0), [team], prior, noise=NoiseBound(0.01))
+    watching.update(Measurement.of_team(0.0, x, torch.zeros_like(x)))
+    assert watching.skipped.tolist() == [1, 1, 1]
+    assert watching.feasible_set.contains(goals).all()
+
+    # Alone, a robot that stands still has arrived: only a joint QP stops robots that have nothing to fear.
+    alone = CollisionAvoidance(ClassK(1.0), safety_distance=0.5)
+    watching = SetMembershipObserver(GoalTask(1.0), [alone], prior, noise=NoiseBound(0.01))
+    watching.update(Measurement.of_team(0.0, x, torch.zeros_like(x)))
+    assert watching.skipped.tolist() == [1, 1, 0]
+    assert watching.feasible_set.contains(x)[2]
+    assert watching.feasible_set.diameter()[2] < 0.03
