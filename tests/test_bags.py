@@ -249,7 +249,9 @@ def test_wrong_sections(fields, expected):
 
 NAN = float("nan")
 WRONG = {
-    "expected finite numbers, got (nan, 0.0, 1.0, 0.0) at t = 1.0 s": lambda k: odometry(k * SECOND, (NAN, 0), (1, 0)),
+    "finite number of at most 1e+12 everywhere, got (nan, 0.0, 1.0, 0.0) at t = 1.0 s": lambda k: odometry(
+        k * SECOND, (NAN, 0), (1, 0)
+    ),
     "expected a unit quaternion, got (0.0, 0.0, 0.0, 0.0)": lambda k: odometry(k * SECOND, (0, 0), (1, 0), (0.0,) * 4),
     "different messages have the same stamp, 0.0 s": lambda k: odometry(0, (k, 0), (1, 0)),
     "positions in different frames: 'odom1' (topic '/odom') and 'odom2' (topic '/odom')": (

@@ -22,6 +22,7 @@ from torchfsid.errors import ConfigError, FsidError, LogError, one_line
 from torchfsid.logs import Log
 from torchfsid.quantities import BodyName, NonNegative, Positive
 from torchfsid.resampling import Track, log_of_tracks
+from torchfsid.tables import A_NUMBER, is_measurable
 
 ODOMETRY, POSE, TRANSFORMS = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "tf2_msgs/msg/TFMessage"
 TF_TOPIC = "/tf"
@@ -174,8 +175,8 @@ def _of_odometry(where: str, message: Any) -> _Sample:
 def _sample(where: str, header: Any, position: Any, velocity: tuple[float, ...] | None) -> _Sample:
     values = position.x, position.y, *(velocity or ())
     stamp = header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
-    if not all(map(math.isfinite, values)):
-        raise LogError(f"{where}: expected finite numbers, got {values} at t = {stamp / 1_000_000_000} s")
+    if not is_measurable(values).all():
+        raise LogError(f"{where}: expected {A_NUMBER} everywhere, got {values} at t = {stamp / 1_000_000_000} s")
     u = None if velocity is None else (values[2], values[3])
     return _Sample(stamp, header.frame_id.removeprefix("/"), (values[0], values[1]), u)
 

@@ -13,6 +13,11 @@ from jaxtyping import Float
 
 from torchfsid.errors import LogError, one_line
 
+LARGEST = 1e12
+"""Larger numbers are no measurements (in SI units, even stamps in seconds since 1970 are smaller)."""
+
+A_NUMBER = f"a finite number of at most {LARGEST:g}"
+
 
 @runtime_checkable
 class Table(Protocol):
@@ -34,8 +39,13 @@ class Table(Protocol):
         ...
 
     def numbers(self, column: str) -> Float[np.ndarray, "rows"]:
-        """The column as finite numbers."""
+        """The column as numbers, none larger than `LARGEST`."""
         ...
+
+
+def is_measurable(values: Any) -> Any:
+    """Is it a number that can have been measured? Squares of such numbers, and their squares, are finite."""
+    return np.abs(values) <= LARGEST
 
 
 def require_column(table: Table, name: str) -> None:
@@ -97,15 +107,15 @@ class CsvTable:
             values = np.fromiter(map(float, cells), dtype=np.float64, count=len(cells))
         except ValueError:
             values = np.array([math.nan])
-        if np.isfinite(values).all():
+        if is_measurable(values).all():
             return values
-        i = next(i for i, cell in enumerate(cells) if not _is_finite(cell))
-        raise self.error(i, f"column {column!r}: expected a finite number, got {reprlib.repr(cells[i])}")
+        i = next(i for i, cell in enumerate(cells) if not _is_number(cell))
+        raise self.error(i, f"column {column!r}: expected {A_NUMBER}, got {reprlib.repr(cells[i])}")
 
 
-def _is_finite(cell: str) -> bool:
+def _is_number(cell: str) -> bool:
     try:
-        return math.isfinite(float(cell))
+        return bool(is_measurable(float(cell)))
     except ValueError:
         return False
 
@@ -156,9 +166,10 @@ class ParquetTable:
         if not (types.is_integer(cells.type) or types.is_floating(cells.type) or types.is_decimal(cells.type)):
             raise self.header_error(f"column {column!r}: expected numbers, it holds {cells.type}")
         values = cells.cast(float64(), safe=False).to_numpy(zero_copy_only=False).astype(np.float64)
-        if not np.isfinite(values).all():
-            i = int(np.argmin(np.isfinite(values)))
-            raise self.error(i, f"column {column!r}: expected a finite number, got {cells[i].as_py()!r}")
+        measurable = is_measurable(values)
+        if not measurable.all():
+            i = int(np.argmin(measurable))
+            raise self.error(i, f"column {column!r}: expected {A_NUMBER}, got {cells[i].as_py()!r}")
         return values
 
     def _column(self, column: str) -> Any:
