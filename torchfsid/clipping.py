@@ -1,19 +1,25 @@
 r"""Intersecting batched polygons with half-spaces, and keeping them small.
 
-While any polygon is cut by more than round-off, cut it by the row that cuts it deepest; only polygons that are really
-cut are touched, and later rows that the deep cuts made redundant never cost anything. The cut is differentiable in the
-rows and in the polygon it started from. Whatever round-off leaves open stays in: the result is an outer set.
+While a polygon is cut by more than round-off, cut it by the row that cuts it deepest; only polygons that are really cut
+are touched, and later rows that the deep cuts made redundant never cost anything. The cut is differentiable in the rows
+and in the polygon it started from. Whatever round-off leaves open stays in: the result is an outer set.
+
+Where no gradient is needed, `polygon_kernel` does the same in compiled code.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchfsid.compiled import array, use_kernel
+from torchfsid.halfspaces import ROUND_OFF
 from torchfsid.polygon import PRIOR, Polygon, cross, excess, lengths, round_off, take
 
 PARALLEL = 1e-14
@@ -44,15 +50,6 @@ class Contradiction:
             nothing.unsqueeze(-1).repeat(1, 1, 2), nothing, nothing.clone(), nothing.new_full((batch, 3), PRIOR).long()
         )
 
-    def record(
-        self, items: Tensor, a: Tensor, c: Tensor, time: Tensor, source: Tensor, lost: Polygon, edges: Tensor
-    ) -> None:
-        """The row (a, c) with the two `edges` of the polygon that meet at the vertex nearest to it."""
-        self.A[items] = torch.cat([a.unsqueeze(1), take(lost.A, edges)], dim=1).detach()
-        self.b[items] = torch.cat([c.unsqueeze(1), lost.b.gather(1, edges)], dim=1).detach()
-        self.time[items] = torch.cat([time.unsqueeze(1), lost.time.gather(1, edges)], dim=1)
-        self.source[items] = torch.cat([source.unsqueeze(1), lost.source.gather(1, edges)], dim=1)
-
 
 @dataclass(frozen=True)
 class Clipped:
@@ -77,47 +74,88 @@ def clip(
     b: Float[Tensor, "B R"],
     time: Float[Tensor, "B"],
     source: Int[Tensor, "B R"],
+    most: int | None = None,
+    compiled: bool | None = None,
 ) -> Clipped:
-    """Intersect every polygon with its R half-spaces A z <= b, stamping new edges with `time` and `source`."""
-    B, before = len(A), polygon
-    outcome = torch.full((B,), Outcome.NONEMPTY, device=A.device)
-    shrunk = torch.zeros(B, dtype=torch.bool, device=A.device)
-    against = Contradiction.none(B, A)
-    cutting = _cuts(polygon, A, b)
-    while len(items := cutting.any(-1).nonzero().squeeze(-1)) > 0:
-        part = polygon.select(items)
+    """Intersect every polygon with its R half-spaces A z <= b, stamping new edges with `time` and `source`.
+
+    A polygon left with more than `most` edges is merged; where that costs more than the cut has gained, it stays as it
+    was. `compiled`: see `use_kernel`.
+
+    Raises:
+        InputError: `compiled` is True and cannot be.
+    """
+    if use_kernel(compiled, A, b, polygon.vertices, polygon.A, polygon.b):
+        return _clip_compiled(polygon, A, b, time, source, most)
+    outcome = torch.full((len(A),), Outcome.NONEMPTY, device=A.device)
+    shrunk = torch.zeros(len(A), dtype=torch.bool, device=A.device)
+    against = Contradiction.none(len(A), A)
+    items = _touched(polygon, A, b).nonzero().squeeze(-1)
+    if len(items) == 0:
+        return Clipped(polygon, outcome, shrunk, against)
+
+    before = polygon.select(items)
+    table = _Table.of(before, A[items], b[items], time[items], source[items])
+    rings, finished = _Rings.start(before, A[items], b[items]), []
+    while len(rings.item) > 0:
         with torch.no_grad():
-            depth = excess(A[items], b[items], part.vertices).amax(-1) / lengths(A[items])
-            row = torch.where(cutting[items], depth, -torch.inf).argmax(-1)
-        a, c = A[items, row], b[items, row]
-        over = (part.vertices @ a.unsqueeze(-1)).squeeze(-1) - c.unsqueeze(-1)
-        tolerance = round_off(a.unsqueeze(1), c.unsqueeze(1), part.reach)
-        kept, strictly = over <= tolerance, over < -tolerance
-        empty, surely = ~kept.any(-1), strictly.any(-1)
-        outcome[items] = torch.where(empty, Outcome.EMPTY, torch.where(surely, outcome[items], Outcome.UNDECIDED))
+            beyond = excess(rings.A, rings.b, rings.vertices).amax(-1)
+            cutting = rings.cutting & (beyond > rings.tolerance)
+            row = torch.where(cutting, beyond / lengths(rings.A), -torch.inf).argmax(-1, keepdim=True)
+            going = cutting.any(-1)
+        if not bool(going.all()):
+            finished.append(rings.select(~going))
+            rings, cutting, row = rings.select(going), cutting[going], row[going]
+            if len(rings.item) == 0:
+                break
+        over = excess(take(rings.A, row), rings.b.gather(1, row), rings.vertices).squeeze(1)
+        tolerance, edge = rings.tolerance.gather(1, row), rings.row.gather(1, row)
+        kept, surely = over <= tolerance, (over < -tolerance).any(-1)
+        empty = ~kept.any(-1)
+        verdict = torch.where(empty, Outcome.EMPTY, torch.where(surely, rings.outcome, Outcome.UNDECIDED))
+        cutting = cutting.scatter(1, row, False) & ~empty.unsqueeze(-1)
+        rings = rings._replace(cutting=cutting, outcome=verdict)
         # Another order of the same sums may have found a vertex beyond the line that this one finds on it.
         cut = surely & ~kept.all(-1)
-        cutting[items, row] = False
 
         if bool(empty.any()):
-            lost, where = part.select(empty), items[empty]
-            cutting[where] = False
-            closest = over[empty].argmin(-1)
-            edges = torch.stack([(closest - 1) % lost.count, closest % lost.count], dim=-1)
-            against.record(where, a[empty], c[empty], time[where], source[where, row[empty]], lost, edges)
-        if bool(cut.any()):
-            where = items[cut]
-            line = _Line(a[cut], c[cut], over[cut], tolerance[cut], time[where], source[where, row[cut]])
-            smaller = _cut(part.select(cut), line)
-            polygon = polygon.replaced(where, smaller)
-            shrunk[where] = True
-            cutting[where] &= _cuts(smaller, A[where], b[where])
+            count, closest = rings.count[empty, None], over[empty].argmin(-1, keepdim=True)
+            met = rings.edge[empty].gather(1, torch.cat([(closest - 1) % count, closest % count], dim=-1))
+            table.select(rings.item[empty]).report(
+                torch.cat([edge[empty], met], dim=-1), items[rings.item[empty]], against
+            )
+        if bool(cut.all()):
+            rings = _cut(rings, over, tolerance, edge, table.padding)
+        elif bool(cut.any()):
+            smaller = _cut(rings.select(cut), over[cut], tolerance[cut], edge[cut], table.padding)
+            rings = _Rings.join([smaller, rings.select(~cut)], table.padding)
 
-    empty = (outcome == Outcome.EMPTY).nonzero().squeeze(-1)
-    if len(empty) > 0:
-        polygon = polygon.replaced(empty, before.select(empty))
-        shrunk[empty] = False
-    return Clipped(polygon, outcome, shrunk, against)
+    rings = _Rings.join(finished, table.padding)
+    outcome[items[rings.item]] = rings.outcome
+    rings = rings.select(rings.shrunk & (rings.outcome != Outcome.EMPTY))
+    smaller = table.select(rings.item).polygon(rings, before.reach[rings.item])
+    where, keep = items[rings.item], torch.ones_like(rings.shrunk)
+    if most is not None and bool((over_full := smaller.count > most).any()):
+        merged = merge(smaller.select(over_full), most)
+        # The areas are sums in some order.
+        keep[over_full] = merged.volume() <= polygon.select(where[over_full]).volume() * (1 - ROUND_OFF)
+        smaller = smaller.replaced(over_full.nonzero().squeeze(-1), merged)
+    shrunk[where] = keep
+    if not bool(keep.all()):
+        where, smaller = where[keep], smaller.select(keep)
+    return Clipped(polygon.replaced(where, smaller), outcome, shrunk, against)
+
+
+def _clip_compiled(polygon: Polygon, A: Tensor, b: Tensor, time: Tensor, source: Tensor, most: int | None) -> Clipped:
+    from torchfsid import polygon_kernel
+
+    fields, outcome, shrunk, against = polygon_kernel.clip(
+        tuple(map(array, polygon.fields())), array(A), array(b), array(time), array(source),
+        A.shape[1] + polygon.slots if most is None else most, ROUND_OFF, PARALLEL,
+    )  # fmt: skip
+    shrunk = torch.from_numpy(shrunk)
+    smaller = Polygon(*map(torch.from_numpy, fields)) if bool(shrunk.any()) else polygon
+    return Clipped(smaller, torch.from_numpy(outcome), shrunk, Contradiction(*map(torch.from_numpy, against)))
 
 
 def merge(polygon: Polygon, most: int) -> Polygon:
@@ -137,54 +175,148 @@ def merge(polygon: Polygon, most: int) -> Polygon:
         polygon = polygon.replaced(over[possible], smaller)
 
 
-@dataclass(frozen=True)
-class _Line:
-    """A line a.z = c that cuts every polygon of a batch: `over` is a.v - c at its vertices."""
+class _Rings(NamedTuple):
+    """Rings being cut: the vertices, for each vertex the number of the edge that it starts, and the rows to cut by.
 
-    a: Tensor
-    c: Tensor
-    over: Tensor
-    tolerance: Tensor
-    time: Tensor
-    source: Tensor
+    Attributes:
+        item: which polygon. row: the numbers of the edges that the rows will make. cutting: rows that may still cut.
+    """
+
+    item: Int[Tensor, "k"]
+    vertices: Float[Tensor, "k V 2"]
+    edge: Int[Tensor, "k V"]
+    count: Int[Tensor, "k"]
+    A: Float[Tensor, "k R 2"]
+    b: Float[Tensor, "k R"]
+    row: Int[Tensor, "k R"]
+    tolerance: Float[Tensor, "k R"]
+    cutting: Bool[Tensor, "k R"]
+    outcome: Int[Tensor, "k"]
+    shrunk: Bool[Tensor, "k"]
+
+    @classmethod
+    def start(cls, polygon: Polygon, A: Tensor, b: Tensor) -> _Rings:
+        """The rings as they are, with the rows that cut any; old edges are numbered by their slots, new ones behind."""
+        tolerance = round_off(A, b, polygon.reach)
+        with torch.no_grad():
+            cutting = excess(A, b, polygon.vertices).amax(-1) > tolerance
+            first = cutting.byte().argsort(dim=-1, descending=True, stable=True)[:, : int(cutting.sum(-1).max())]
+        return cls(
+            item=torch.arange(len(b), device=b.device),
+            vertices=polygon.vertices,
+            edge=torch.arange(polygon.slots, device=b.device).expand(len(b), -1),
+            count=polygon.count,
+            A=take(A, first),
+            b=b.gather(1, first),
+            row=polygon.slots + first,
+            tolerance=tolerance.gather(1, first),
+            cutting=cutting.gather(1, first),
+            outcome=torch.full_like(polygon.count, Outcome.NONEMPTY),
+            shrunk=torch.zeros_like(polygon.count, dtype=torch.bool),
+        )
+
+    def select(self, items: Tensor) -> _Rings:
+        return _Rings(*(field[items] for field in self))
+
+    @classmethod
+    def join(cls, parts: Sequence[_Rings], padding: int) -> _Rings:
+        slots = max(part.vertices.shape[1] for part in parts)
+        return cls(
+            *(torch.cat(fields) for fields in zip(*(part._widened(slots, padding) for part in parts), strict=True))
+        )
+
+    def _widened(self, slots: int, padding: int) -> _Rings:
+        extra = slots - self.vertices.shape[1]
+        if extra == 0:
+            return self
+        return self._replace(
+            vertices=torch.cat([self.vertices, self.vertices[:, :1].expand(-1, extra, 2)], dim=1),
+            edge=torch.nn.functional.pad(self.edge, (0, extra), value=padding),
+        )
 
 
-def _cut(polygon: Polygon, line: _Line) -> Polygon:
-    """The part of each polygon on the inner side of a line that really cuts it.
+class _Table(NamedTuple):
+    """What edges there may be: of the polygons by their slots, then of the rows; the last one is padding."""
+
+    A: Float[Tensor, "k E 2"]
+    b: Float[Tensor, "k E"]
+    time: Float[Tensor, "k E"]
+    source: Int[Tensor, "k E"]
+
+    @classmethod
+    def of(cls, polygon: Polygon, A: Tensor, b: Tensor, time: Tensor, source: Tensor) -> _Table:
+        old = (polygon.A, polygon.b, polygon.time, polygon.source)
+        new = (A, b, time.unsqueeze(-1).expand_as(b), source)
+        return cls(
+            *(torch.cat([o, n, p.unsqueeze(1)], dim=1) for o, n, p in zip(old, new, polygon.padding(), strict=True))
+        )
+
+    @property
+    def padding(self) -> int:
+        return self.b.shape[1] - 1
+
+    def select(self, items: Tensor) -> _Table:
+        return _Table(*(field[items] for field in self))
+
+    def polygon(self, rings: _Rings, reach: Tensor) -> Polygon:
+        A, (b, time, source) = take(self.A, rings.edge), (column.gather(1, rings.edge) for column in self[1:])
+        return Polygon(rings.vertices, A, b, time, source, rings.count, reach)
+
+    def report(self, edges: Int[Tensor, "k 3"], items: Tensor, against: Contradiction) -> None:
+        """Three edges that contradict each other."""
+        against.A[items] = take(self.A, edges).detach()
+        for known, column in zip((against.b, against.time, against.source), self[1:], strict=True):
+            known[items] = column.gather(1, edges).detach()
+
+
+@torch.no_grad()
+def _touched(polygon: Polygon, A: Float[Tensor, "B R 2"], b: Float[Tensor, "B R"]) -> Bool[Tensor, "B"]:
+    """Polygons with a vertex beyond some row, by more than round-off; bounding boxes rule most others out first."""
+    lower, upper = polygon.vertices.amin(1), polygon.vertices.amax(1)
+    beyond = excess(A.clamp(min=0), b, upper.unsqueeze(1)) + A.clamp(max=0) @ lower.unsqueeze(-1)
+    touched = (beyond > 0).flatten(1).any(-1)
+    items = touched.nonzero().squeeze(-1)
+    if len(items) > 0:
+        A, b, part = A[items], b[items], polygon.select(items)
+        touched[items] = (excess(A, b, part.vertices).amax(-1) > round_off(A, b, part.reach)).any(-1)
+    return touched
+
+
+def _cut(rings: _Rings, over: Tensor, tolerance: Tensor, new: Tensor, padding: int) -> _Rings:
+    """The part of each ring on the inner side of a line that really cuts it: `over` is a.v - c at its vertices.
 
     The vertices kept form one arc of the ring, first..last, around the deepest vertex; it is closed by the points where
-    the ring leaves and enters the half-plane, unless the arc already ends on the line.
+    the ring leaves and enters the half-plane, unless the arc already ends on the line. `new` numbers the line's edge.
     """
-    V, count = polygon.slots, polygon.count.unsqueeze(-1)
-    slot = torch.arange(V, device=count.device)
-    kept = line.over <= line.tolerance
-    deepest = line.over.argmin(-1, keepdim=True)
+    count = rings.count.unsqueeze(-1)
+    slot = torch.arange(over.shape[1], device=count.device)
+    kept = over <= tolerance
+    deepest = over.argmin(-1, keepdim=True)
     ahead = kept.gather(1, (deepest + slot) % count).long().cumprod(-1).sum(-1, keepdim=True).clamp(max=count)
     behind = kept.gather(1, (deepest - slot) % count).long().cumprod(-1).sum(-1, keepdim=True).clamp(max=count)
     length = ahead + behind - 1
     first, last = (deepest - behind + 1) % count, (deepest + ahead - 1) % count
     before, after = (first - 1) % count, (last + 1) % count
-    leaves = line.over.gather(1, last) < -line.tolerance
-    enters = line.over.gather(1, first) < -line.tolerance
+    leaves = over.gather(1, last) < -tolerance
+    enters = over.gather(1, first) < -tolerance
 
     total = length + leaves + enters
     slot = torch.arange(int(total.max()), device=count.device)
-    on_arc = slot < length
-    vertices = take(polygon.vertices, torch.where(on_arc, (first + slot) % count, first))
-    vertices = torch.where(((slot == length) & leaves).unsqueeze(-1), _crossing(polygon, line, last, after), vertices)
-    vertices = torch.where(
-        ((slot == length + leaves) & enters).unsqueeze(-1), _crossing(polygon, line, first, before), vertices
-    )
+    position = torch.where(slot < length, (first + slot) % count, first)
+    vertices = take(rings.vertices, position)
+    out, back = (slot == length) & leaves, (slot == length + leaves) & enters
+    vertices = torch.where(out.unsqueeze(-1), _crossing(rings.vertices, over, last, after), vertices)
+    vertices = torch.where(back.unsqueeze(-1), _crossing(rings.vertices, over, first, before), vertices)
+    edge = rings.edge.gather(1, torch.where(slot < length, position, before))
+    edge = torch.where(slot == length - 1 + leaves, new, edge).masked_fill(slot >= total, padding)
+    shrunk = torch.ones_like(rings.shrunk)
+    return rings._replace(vertices=vertices, edge=edge, count=total.squeeze(-1), shrunk=shrunk)
 
-    edge = torch.where(on_arc, (first + slot) % count, before)
-    edge = torch.where(slot == length - 1 + leaves, V, torch.where(slot >= total, V + 1, edge))
-    return _ring(polygon, vertices, edge, total.squeeze(-1), line)
 
-
-def _crossing(polygon: Polygon, line: _Line, inner: Tensor, outer: Tensor) -> Tensor:
+def _crossing(vertices: Tensor, over: Tensor, inner: Tensor, outer: Tensor) -> Float[Tensor, "k 1 2"]:
     """Where the ring meets the line, between a vertex within and one beyond."""
-    s_inner, s_outer = line.over.gather(1, inner), line.over.gather(1, outer)
-    start, end = take(polygon.vertices, inner), take(polygon.vertices, outer)
+    s_inner, s_outer = over.gather(1, inner), over.gather(1, outer)
+    start, end = take(vertices, inner), take(vertices, outer)
     return start + (s_inner / (s_inner - s_outer)).unsqueeze(-1) * (end - start)
 
 
@@ -206,30 +338,12 @@ def _without_edge(polygon: Polygon, dropped: Int[Tensor, "B 1"], corner: Float[T
     """Each ring without one edge, its two ends replaced by the corner in which the neighbours meet."""
     count, V = polygon.count.unsqueeze(-1), polygon.slots
     slot = torch.arange(V - 1, device=count.device)
-    padding = slot >= count - 1
-    position = torch.where(padding, 0, (dropped + 1 + slot) % count)
-    vertices = torch.where(((slot == 0) | padding).unsqueeze(-1), corner, take(polygon.vertices, position))
-    return _ring(polygon, vertices, torch.where(padding, V + 1, position), polygon.count - 1)
-
-
-def _ring(
-    polygon: Polygon,
-    vertices: Float[Tensor, "B W 2"],
-    edge: Int[Tensor, "B W"],
-    count: Int[Tensor, "B"],
-    line: _Line | None = None,
-) -> Polygon:
-    """New rings whose edges are old ones by their slot, or V: the new line, or V + 1: padding."""
-    none = polygon.padding()
-    new = none if line is None else (line.a, line.c, line.time, line.source)
-    old = (polygon.A, polygon.b, polygon.time, polygon.source)
-    tables = [torch.cat([o, n.unsqueeze(1), p.unsqueeze(1)], dim=1) for o, n, p in zip(old, new, none, strict=True)]
-    A, *others = tables
-    b, time, source = (table.gather(1, edge) for table in others)
-    return Polygon(vertices, take(A, edge), b, time, source, count, polygon.reach)
-
-
-@torch.no_grad()
-def _cuts(polygon: Polygon, A: Float[Tensor, "B R 2"], b: Float[Tensor, "B R"]) -> Bool[Tensor, "B R"]:
-    """Rows that some vertex exceeds by more than round-off."""
-    return excess(A, b, polygon.vertices).amax(-1) > round_off(A, b, polygon.reach)
+    filled = slot < count - 1
+    position = torch.where(filled, (dropped + 1 + slot) % count, 0)
+    vertices = torch.where(((slot == 0) | ~filled).unsqueeze(-1), corner, take(polygon.vertices, position))
+    fields = take(polygon.A, position), *(f.gather(1, position) for f in (polygon.b, polygon.time, polygon.source))
+    A, b, time, source = (
+        torch.where(filled if field.ndim == 2 else filled.unsqueeze(-1), field, nothing.unsqueeze(1))
+        for field, nothing in zip(fields, polygon.padding(), strict=True)
+    )
+    return Polygon(vertices, A, b, time, source, polygon.count - 1, polygon.reach)

@@ -19,6 +19,9 @@ from torch import Tensor
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.kkt import RANK_TOLERANCE, outward_normals, solve_kkt
 
+FAN = 3
+"""Normals of a ray: two sides and a cap."""
+
 
 def critical_region(
     safe_controls: Halfspaces,
@@ -40,7 +43,7 @@ def critical_region(
     inactive = replace(inactive, source=torch.arange(safe_controls.rows, device=active.device))
 
     # C theta + d - u* = P (C theta + d) - A_a^+ b_a lies in the span of the active rows: normals across it say nothing.
-    normals, generator = outward_normals(unit.A, active, fan=3)
+    normals, generator = outward_normals(unit.A, active, FAN)
     along = normals @ kkt.projector
     multipliers = Halfspaces(
         along @ C,

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchfsid.clipping import Outcome, clip, merge
+from torchfsid.clipping import Outcome, clip
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import ROUND_OFF, Halfspaces
 from torchfsid.polygon import Polygon
@@ -107,41 +107,42 @@ class FeasibleSet:
     def is_empty(self) -> Bool[Tensor, "*batch"]:
         return self.outcome == Outcome.EMPTY
 
-    def intersect(self, halfspaces: Halfspaces, time: float | Float[Tensor, "*batch"] = float("nan")) -> FeasibleSet:
+    def intersect(
+        self,
+        halfspaces: Halfspaces,
+        time: float | Float[Tensor, "*batch"] = float("nan"),
+        compiled: bool | None = None,
+    ) -> FeasibleSet:
         """The part of the set inside the half-spaces, whose facets are stamped with `time` [s] and the rows' `source`
         (default: 0, 1, ...).
 
         Rows that only touch the set within round-off are left out (an outer set). If merging facets would cost more
-        than the cut has gained, the set stays as it was.
+        than the cut has gained, the set stays as it was. `compiled`: see `use_kernel`; in the plane only.
 
         Raises:
-            InputError: dimension or batch do not fit, or a row is NaN or infinite.
+            InputError: dimension or batch do not fit, or a row is NaN or infinite, or `compiled` cannot be.
         """
         p, m = self.dim, halfspaces.rows
-        if halfspaces.dim != p or torch.broadcast_shapes(halfspaces.batch_shape, self.batch_shape) != self.batch_shape:
+        if halfspaces.dim != p or not _fits(halfspaces.batch_shape, self.batch_shape):
             expected = f"rows over R^{p} for a batch {tuple(self.batch_shape)}"
             raise InputError("halfspaces", expected, (tuple(halfspaces.A.shape), tuple(halfspaces.b.shape)))
         if not bool(halfspaces.A.isfinite().all() & halfspaces.b.isfinite().all()):
             raise InputError("halfspaces", "finite rows", "NaN or infinity")
         source = torch.arange(m, device=self.outcome.device) if halfspaces.source is None else halfspaces.source
         halfspaces = halfspaces.where(~self.is_empty.unsqueeze(-1))
-        cut, joined = (clip, merge) if p == 2 else (clip_polytope, merge_polytope)
         stamp = torch.as_tensor(time, dtype=torch.float64, device=self.outcome.device).expand(self.batch_shape)
-        clipped = cut(
-            self.body,
+        rows = (
             halfspaces.A.expand(*self.batch_shape, m, p).reshape(-1, m, p),
             halfspaces.b.expand(*self.batch_shape, m).reshape(-1, m),
             stamp.reshape(-1),
             source.expand(*self.batch_shape, m).reshape(-1, m),
         )
-        body: Any = clipped.body
-        shrunk = clipped.shrunk
-        over = (body.count > self.max_facets).nonzero().squeeze(-1)
-        if len(over) > 0:
-            merged = joined(body.select(over), self.max_facets)
-            grown = merged.volume() > self.body.select(over).volume()
-            body = body.replaced(over, merged).replaced(over[grown], self.body.select(over[grown]))
-            shrunk = shrunk.index_fill(0, over[grown], False)
+        if p == 2:
+            clipped: Any = clip(self.body, *rows, self.max_facets, compiled)
+            body, shrunk = clipped.body, clipped.shrunk
+        else:
+            clipped = clip_polytope(self.body, *rows)
+            body, shrunk = _merged(self.body, clipped.body, clipped.shrunk, self.max_facets)
         shape = self.batch_shape
         found = clipped.contradiction
         fresh = Facets(
@@ -244,6 +245,24 @@ class FeasibleSet:
 
     def _batched(self, flat: Tensor) -> Tensor:
         return flat.reshape((*self.batch_shape, *flat.shape[1:]))
+
+
+def _fits(shape: torch.Size, batch: torch.Size) -> bool:
+    """Do rows of this batch shape broadcast to the sets' batch?"""
+    return len(shape) <= len(batch) and all(n in (1, N) for n, N in zip(reversed(shape), reversed(batch), strict=False))
+
+
+def _merged(
+    before: Polytope, body: Polytope, shrunk: Bool[Tensor, "B"], most: int
+) -> tuple[Polytope, Bool[Tensor, "B"]]:
+    """With at most `most` facets, or as before where merging would cost more than the cut has gained."""
+    over = (body.count > most).nonzero().squeeze(-1)
+    if len(over) == 0:
+        return body, shrunk
+    merged = merge_polytope(body.select(over), most)
+    grown = merged.volume() > before.select(over).volume()
+    body = body.replaced(over, merged).replaced(over[grown], before.select(over[grown]))
+    return body, shrunk.index_fill(0, over[grown], False)
 
 
 def _choose(mask: Bool[Tensor, "*batch"], mine: Facets, other: Facets) -> Facets:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np  # its broadcast_shapes does not wait for sympy
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -38,8 +39,8 @@ class Halfspaces:
             raise InputError("Halfspaces(A, b)", "A (*batch, m, n) and b (*batch, m)", (tuple(A.shape), tuple(b.shape)))
         if A.shape[:-1] != b.shape:
             try:
-                batch = torch.broadcast_shapes(A.shape[:-2], b.shape[:-1])
-            except RuntimeError as error:
+                batch = np.broadcast_shapes(A.shape[:-2], b.shape[:-1])
+            except ValueError as error:
                 raise InputError("Halfspaces(A, b)", "equal batch shapes", (tuple(A.shape), tuple(b.shape))) from error
             A, b = A.expand(*batch, *A.shape[-2:]), b.expand(*batch, b.shape[-1])
         object.__setattr__(self, "A", A.to(torch.float64))
@@ -50,7 +51,7 @@ class Halfspaces:
     @classmethod
     def stack(cls, parts: Sequence[Halfspaces]) -> Halfspaces:
         """The intersection of several, their rows one below the other; batches broadcast."""
-        batch = torch.broadcast_shapes(*(part.batch_shape for part in parts))
+        batch = np.broadcast_shapes(*(part.batch_shape for part in parts))
         sources = [part.source.expand(*batch, part.rows) for part in parts if part.source is not None]
         return cls(
             torch.cat([part.A.expand(*batch, part.rows, part.dim) for part in parts], dim=-2),
@@ -81,7 +82,7 @@ class Halfspaces:
 
     def norms(self) -> Float[Tensor, "*batch m"]:
         """|a_j|, with 1 for padding rows, so that dividing by it is always safe (and so is its gradient)."""
-        squared = self.A.square().sum(-1)
+        squared = _dot(self.A, self.A)
         padding = squared == 0
         return torch.where(padding, 1.0, squared.masked_fill(padding, 1.0).sqrt())
 
@@ -92,13 +93,19 @@ class Halfspaces:
 
     def slack(self, z: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch m"]:
         """(b_j - a_j.z)/|a_j|: the signed distance of z to each boundary, positive inside, in the units of z."""
-        return (self.b - (self.A @ z.to(torch.float64).unsqueeze(-1)).squeeze(-1)) / self.norms()
+        return (self.b - _dot(self.A, z.to(torch.float64).unsqueeze(-2))) / self.norms()
 
     def round_off(self, z: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch m"]:
         """What floating point leaves open about `slack(z)`, in the units of z."""
-        sizes = (self.A.abs() @ z.abs().to(torch.float64).unsqueeze(-1)).squeeze(-1) + self.b.abs()
+        sizes = _dot(self.A.abs(), z.abs().to(torch.float64).unsqueeze(-2)) + self.b.abs()
         return (ROUND_OFF * sizes / self.norms()).detach()
 
     def contains(self, z: Float[Tensor, "*batch n"], tolerance: float = 0.0) -> Bool[Tensor, "*batch"]:
         """Is z inside, up to a distance `tolerance` (units of z)?"""
         return (self.slack(z) >= -tolerance).all(-1)
+
+
+def _dot(v: Float[Tensor, "*#batch n"], w: Float[Tensor, "*#batch n"]) -> Float[Tensor, "*#batch"]:
+    """v.w, faster than a product of many small matrices, and rounded alike in every batch."""
+    products = (v * w).unbind(-1) if v.shape[-1] else (torch.zeros_like(v).sum(-1),)
+    return sum(products[1:], start=products[0])

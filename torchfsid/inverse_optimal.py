@@ -122,14 +122,20 @@ def inverse_optimal_set(
 
     normals, generator = outward_normals(generators, may_be_active, FAN)
     source = m + torch.where(generator < generators.shape[-2], generator % max(m, 1), m)
-    along_u = (normals @ u.unsqueeze(-1)).squeeze(-1)
-    nominal = Halfspaces(normals, along_u + ball.unsqueeze(-1), source).where((normals != 0).any(-1))
-    if saturation is not None:
-        if possible is None:
-            raise InputError("possible", "the nominal controls that are still possible, for a saturation", None)
-        nominal = unclipped(nominal, saturation, possible, drift)
+    needed = (normals != 0).any(-1)
+    room = (ball + drift).unsqueeze(-1)
+    if saturation is None:
+        return Halfspaces(normals @ C, torch.where(needed, _along(normals, u - d) + room, 1.0), source)
+    if possible is None:
+        raise InputError("possible", "the nominal controls that are still possible, for a saturation", None)
+    nominal = Halfspaces(normals, _along(normals, u) + ball.unsqueeze(-1), source).where(needed)
+    nominal = unclipped(nominal, saturation, possible, drift)
     is_row = (nominal.A != 0).any(-1)
     return Halfspaces(nominal.A, nominal.b + drift.unsqueeze(-1) * is_row, nominal.source).pullback(C, d)
+
+
+def _along(normals: Float[Tensor, "*batch k n"], v: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch k"]:
+    return (normals @ v.unsqueeze(-1)).squeeze(-1)
 
 
 def per_row(bound: float | Float[Tensor, "*batch"], like: Tensor) -> Float[Tensor, "*batch 1"]:

@@ -19,18 +19,21 @@ from enum import IntEnum
 from functools import cached_property
 from typing import Literal, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchfsid.active_set import ACTIVE_TOLERANCE, active_set
 from torchfsid.barriers import Barrier, controller_failed
+from torchfsid.compiled import array, installed, use_kernel
+from torchfsid.critical_region import FAN as CRITICAL_FAN
 from torchfsid.critical_region import critical_region
 from torchfsid.errors import InconsistentError, InputError
 from torchfsid.feasible_set import FeasibleSet
-from torchfsid.halfspaces import Halfspaces
-from torchfsid.inverse_optimal import NoiseBound, Uncertainty, inverse_optimal_set, per_row
-from torchfsid.kkt import KktSolution, solve_kkt
+from torchfsid.halfspaces import ROUND_OFF, Halfspaces
+from torchfsid.inverse_optimal import FAN, SPREAD, NoiseBound, Uncertainty, inverse_optimal_set, per_row
+from torchfsid.kkt import ANGLE_TOLERANCE, RANK_TOLERANCE, KktSolution, solve_kkt
 from torchfsid.measurement import ErrorBounds, Measurement
 from torchfsid.tasks import Task
 
@@ -90,6 +93,7 @@ class Reading(NamedTuple):
 
     Attributes:
         omega: half-spaces of theta; padding where the sample is not used.
+        kkt: u* = G theta + f at the observed active set.
         informative: the sample is used. alarmed: it is not, because a hard row is violated beyond its bound.
         safe_controls, C, d: the model at this measurement, zeros where it could not be evaluated.
         slack: of the measured control to every row [m/s]. excess: its violation beyond the bound, positive if there is
@@ -97,6 +101,7 @@ class Reading(NamedTuple):
     """
 
     omega: Halfspaces
+    kkt: KktSolution
     informative: Bool[Tensor, "B"]
     alarmed: Bool[Tensor, "B"]
     safe_controls: Halfspaces
@@ -119,11 +124,14 @@ class SetMembershipObserver:
         active_tolerance: when a row counts as active for `critical_region`, for the case label and for (G, f) [m/s].
         on_inconsistent: what an empty intersection does: `hold` the set as it was, `reset` it to the prior and go on
             from there (a change of goal; the status stays OK, the event is recorded), or `raise` an `InconsistentError`.
+        compiled: run in the compiled kernels (extra `fast`); None: wherever they can, which is where no gradient is needed
+            and theta is planar; the sets are the same up to round-off.
         status, skipped, events: per robot: `Status`, number of samples without information, first ALARM and
         INCONSISTENT.
 
     Raises:
-        InputError: the prior is not a batch (B,) over the task's parameters; `inverse_optimal` comes without `noise`.
+        InputError: the prior is not a batch (B,) over the task's parameters; `inverse_optimal` comes without `noise`;
+            `compiled` is True, but theta is not planar, the nominal control is clipped or numba is not installed.
     """
 
     task: Task
@@ -133,6 +141,7 @@ class SetMembershipObserver:
     noise: NoiseBound | None = None
     active_tolerance: float = ACTIVE_TOLERANCE
     on_inconsistent: OnInconsistent = "hold"
+    compiled: bool | None = None
     prior: FeasibleSet = field(init=False)
     status: Int[Tensor, "B"] = field(init=False)
     skipped: Int[Tensor, "B"] = field(init=False)
@@ -147,6 +156,9 @@ class SetMembershipObserver:
             raise InputError("noise", "a NoiseBound, since the set is inverse_optimal", None)
         if self.kind == "critical_region" and self.task.saturation is not None:
             raise InputError("kind", "inverse_optimal, since the nominal control is clipped", self.kind)
+        if self.compiled and not (p == 2 and self.task.saturation is None and installed()):
+            expected = "None or False unless theta is planar, nothing is clipped and numba is installed"
+            raise InputError("compiled", expected, True)
         self.prior = self.feasible_set
         self.status = torch.zeros(self.feasible_set.batch_shape, dtype=torch.long)
         self.skipped = torch.zeros_like(self.status)
@@ -159,16 +171,15 @@ class SetMembershipObserver:
             InconsistentError: an intersection is empty, and `on_inconsistent` is `raise`.
         """
         reading, t = self.read(measurement), measurement.t
-        narrowed = self.feasible_set.intersect(reading.omega, time=t)
-        contradicted = narrowed.is_empty
-        self._report(t, reading.alarmed, reading.slack, narrowed)
-        instead = self.feasible_set if self.on_inconsistent == "hold" else self.prior
-        self.feasible_set = narrowed.where(~contradicted, instead)
+        narrowed = self.feasible_set.intersect(reading.omega, t, self.compiled)
+        informative = reading.informative
+        if bool(reading.alarmed.any()) or bool(narrowed.is_empty.any()):
+            self._report(t, reading.alarmed, reading.slack, narrowed)
+            informative = informative & ~narrowed.is_empty
+            narrowed = narrowed.where(~narrowed.is_empty, self._instead())
+        self.feasible_set = narrowed
         self.skipped = self.skipped + (~reading.informative).long()
-        assert measurement.u is not None
-        active = active_set(reading.safe_controls, measurement.u, self.active_tolerance)
-        kkt = solve_kkt(reading.safe_controls, active, reading.C, reading.d)
-        return SetEstimate(t, self.feasible_set, kkt, reading.informative & ~contradicted, self.status)
+        return SetEstimate(t, self.feasible_set, reading.kkt, informative, self.status)
 
     def read(self, measurement: Measurement) -> Reading:
         """What a measurement of all robots says about theta; nothing is changed.
@@ -183,39 +194,81 @@ class SetMembershipObserver:
         rows = Halfspaces.stack(parts)
         C, d = self.task(measurement)
         evaluated = rows.b.isfinite() & rows.A.isfinite().all(-1)
-        wish_known = C.isfinite().all(-1).all(-1) & d.isfinite().all(-1)
-        safe_controls = rows.where(evaluated)
-        C, d = torch.where(wish_known[:, None, None], C, 0.0), torch.where(wish_known[:, None], d, 0.0)
-        slack = safe_controls.slack(u)
-        uncertainty = self._uncertainty(measurement)
-        hard = torch.cat([torch.full((part.rows,), not b.soft) for part, b in zip(parts, self.barriers, strict=True)])
-        bound = slack.new_tensor(self.active_tolerance) if self.noise is None else per_row(self.noise.slack, slack)
-        if uncertainty is not None:
-            bound = bound + uncertainty.slack
-        excess = -slack - bound - safe_controls.round_off(u)
-        measured = evaluated.all(-1) & wish_known & ~controller_failed(self.barriers, measurement, slack)
+        known = C.isfinite().all(-1).all(-1) & d.isfinite().all(-1)
+        if not bool(evaluated.all() & known.all()):
+            rows = rows.where(evaluated)
+            C, d = torch.where(known[:, None, None], C, 0.0), torch.where(known[:, None], d, 0.0)
+        usable = evaluated.all(-1) & known
         if measurement.observed is not None:
-            measured = measured & measurement.observed
+            usable = usable & measurement.observed
+        hard = torch.cat([torch.full((part.rows,), not b.soft) for part, b in zip(parts, self.barriers, strict=True)])
+        model = rows, u.to(torch.float64), C.to(torch.float64), d.to(torch.float64)
+        uncertainty = self._uncertainty(measurement)
+        planar = rows.dim == C.shape[-1] == 2 and self.task.saturation is None
+        bounds = (self.noise.velocity, self.noise.slack) if self.noise is not None else ()
+        tensors = [bound for bound in (*(uncertainty or ()), *bounds) if isinstance(bound, Tensor)]
+        if planar and use_kernel(self.compiled, rows.A, rows.b, *model[1:], *tensors):
+            return self._read_compiled(*model, hard, usable, uncertainty)
+        return self._read(*model, hard, usable, uncertainty)
+
+    def _read(
+        self, rows: Halfspaces, u: Tensor, C: Tensor, d: Tensor, hard: Tensor, usable: Tensor, more: Uncertainty | None
+    ) -> Reading:
+        slack = rows.slack(u)
+        excess = -slack - self._slack_bound(slack, more) - rows.round_off(u)
+        failed = (u == 0).all(-1) & (slack < 0).any(-1)
+        measured = usable & ~failed
         alarmed = measured & ((excess > 0) & hard).any(-1)
         informative = measured & ~alarmed
-
+        active = active_set(rows, u, self.active_tolerance)
+        kkt = solve_kkt(rows, active, C, d)
         if self.kind == "critical_region":
-            active = active_set(safe_controls, u, self.active_tolerance)
-            omega = critical_region(safe_controls, active, C, d)
+            omega = critical_region(rows, active, C, d)
         else:
             assert self.noise is not None
+            saturation = self.task.saturation
+            possible = None if saturation is None else self._possible(C, d)
             omega = inverse_optimal_set(
-                safe_controls,
-                u,
-                C,
-                d,
-                self.noise,
-                uncertainty=uncertainty,
-                saturation=self.task.saturation,
-                possible=None if self.task.saturation is None else self._possible(C, d),
+                rows, u, C, d, self.noise, uncertainty=more, saturation=saturation, possible=possible
             )
-        omega = omega.where(informative.unsqueeze(-1))
-        return Reading(omega, informative, alarmed, safe_controls, C, d, slack, excess, hard)
+        if not bool(informative.all()):
+            omega = omega.where(informative.unsqueeze(-1))
+        return Reading(omega, kkt, informative, alarmed, rows, C, d, slack, excess, hard)
+
+    def _read_compiled(
+        self, rows: Halfspaces, u: Tensor, C: Tensor, d: Tensor, hard: Tensor, usable: Tensor, more: Uncertainty | None
+    ) -> Reading:
+        """The same, in `reading_kernel`."""
+        from torchfsid import reading_kernel
+
+        paper = self.kind == "critical_region"
+        batch = rows.batch_shape
+        bound = self._slack_bound(rows.b, more).expand(rows.b.shape)
+        velocity = per_row(0.0 if self.noise is None else self.noise.velocity, u).squeeze(-1)
+        ball = (velocity if more is None else velocity + more.velocity + more.drift).expand(batch)
+        angles = u.new_zeros(*batch, 0) if more is None or paper else more.angle
+        turn = np.linspace(0.0, 2 * np.pi, CRITICAL_FAN if paper else FAN)
+        around = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+        tensors = (rows.A, rows.b, hard, C, d, u, usable, bound, angles, ball)
+        omega, judged, kkt = reading_kernel.read(
+            *map(array, tensors), np.array(SPREAD), around, paper, self.active_tolerance,
+            ROUND_OFF, RANK_TOLERANCE, ANGLE_TOLERANCE,
+        )  # fmt: skip
+        informative, alarmed, slack, excess = map(torch.from_numpy, judged)
+        return Reading(
+            Halfspaces(*map(torch.from_numpy, omega)),
+            KktSolution(*map(torch.from_numpy, kkt)),
+            informative, alarmed, rows, C, d, slack, excess, hard,
+        )  # fmt: skip
+
+    def _slack_bound(self, like: Tensor, more: Uncertainty | None) -> Tensor:
+        """How far from its boundary an active row may be measured [m/s]."""
+        bound = like.new_tensor([self.active_tolerance]) if self.noise is None else per_row(self.noise.slack, like)
+        return bound if more is None else bound + more.slack
+
+    def _instead(self) -> FeasibleSet:
+        """What takes the place of an empty set."""
+        return self.feasible_set if self.on_inconsistent == "hold" else self.prior
 
     def _report(self, t: float, alarmed: Tensor, slack: Tensor, narrowed: FeasibleSet) -> None:
         """Record what went wrong for the first time, and raise the statuses."""

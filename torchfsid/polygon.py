@@ -67,19 +67,21 @@ class Polygon:
 
     def select(self, items: Tensor) -> Polygon:
         """The sub-batch at `items` (indices or a mask)."""
-        return Polygon(*(field[items] for field in self._fields()))
+        return Polygon(*(field[items] for field in self.fields()))
 
     def replaced(self, items: Tensor, other: Polygon) -> Polygon:
-        """This batch with `other` in the places `items` (a mask)."""
+        """This batch with `other` in the places `items`."""
+        if len(items) == 0:
+            return self
         slots = max(self.slots, other.slots)
         return Polygon(
             *(
                 mine.index_put((items,), theirs)
-                for mine, theirs in zip(self._widened(slots)._fields(), other._widened(slots)._fields(), strict=True)
+                for mine, theirs in zip(self._widened(slots).fields(), other._widened(slots).fields(), strict=True)
             )
         )
 
-    def _fields(self) -> tuple[Tensor, ...]:
+    def fields(self) -> tuple[Tensor, ...]:
         return self.vertices, self.A, self.b, self.time, self.source, self.count, self.reach
 
     def padding(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
