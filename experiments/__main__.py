@@ -1,4 +1,4 @@
-"""The command line: `python -m experiments run CONFIG --out DIR`, `python -m experiments figures DIR`.
+"""The command line: `python -m experiments run CONFIG --out DIR`, `... sweep CONFIG --out DIR`, `... figures DIR`.
 
 Everything is validated before PyTorch is loaded and before anything is written: a mistake costs one clear line on
 stderr and exit code 2.
@@ -10,9 +10,10 @@ import argparse
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from experiments.config import load_experiment
+from experiments.sweep_config import load_sweep
 from torchfsid.errors import ConfigError, FsidError
 
 if TYPE_CHECKING:
@@ -36,15 +37,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _Parser(prog="experiments", description="The paper's experiments: results first, figures from them.")
     commands = parser.add_subparsers(dest="command", required=True)
     run = commands.add_parser("run", help="run an experiment and draw its figures")
-    run.add_argument("config", type=Path, metavar="CONFIG", help="YAML, see configs/")
-    run.add_argument("--out", type=Path, required=True, metavar="DIR", help="results folder")
-    run.add_argument("--set", action="append", default=[], metavar="A.B=VALUE", help="override a key of the config")
+    sweep = commands.add_parser("sweep", help="finish a sweep: run what is not in its folder yet, and draw its figures")
+    for command in (run, sweep):
+        command.add_argument("config", type=Path, metavar="CONFIG", help="YAML, see configs/")
+        command.add_argument("--out", type=Path, required=True, metavar="DIR", help="results folder")
+        command.add_argument("--set", action="append", default=[], metavar="A.B=VALUE", help="override a key")
+    where = sweep.add_mutually_exclusive_group()
+    where.add_argument("--jobs", type=_jobs, default=1, metavar="N", help="processes; -1: one per core (default: 1)")
+    where.add_argument("--dask", metavar="ADDRESS", help="run on a Dask cluster, tcp://HOST:PORT of its scheduler")
     figures = commands.add_parser("figures", help="draw the figures of a results folder again")
     figures.add_argument("folder", type=Path, metavar="DIR", help="results folder of a run")
     chosen = parser.parse_args(arguments)
     try:
         if chosen.command == "run":
             _run(chosen.config, chosen.out, chosen.set)
+        elif chosen.command == "sweep":
+            _sweep(chosen.config, chosen.out, chosen.set, chosen.jobs, chosen.dask)
         else:
             _draw(chosen.folder)
     except FsidError as error:
@@ -59,10 +67,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _run(path: Path, out: Path, overrides: Sequence[str]) -> None:
-    config = load_experiment(path, overrides)
+def _jobs(text: str) -> int:
+    if text != "-1" and not (text.isdecimal() and int(text) > 0):
+        raise argparse.ArgumentTypeError(f"expected a number of processes, or -1, got {text!r}")
+    return int(text)
+
+
+def _require_folder(out: Path) -> None:
     if out.exists() and not out.is_dir():
         raise ConfigError(f"--out: {out} is not a folder")
+
+
+def _run(path: Path, out: Path, overrides: Sequence[str]) -> None:
+    config = load_experiment(path, overrides)
+    _require_folder(out)
 
     import torch
     from rich.console import Console
@@ -82,6 +100,43 @@ def _run(path: Path, out: Path, overrides: Sequence[str]) -> None:
     _draw(out)
     console = Console(width=max(Console().width, TABLE_WIDTH))
     (print_table if config.kind == "cases" else print_verdict)(summary, console)
+
+
+def _sweep(path: Path, out: Path, overrides: Sequence[str], jobs: int, dask: str | None) -> None:
+    config = load_sweep(path, overrides)
+    _require_folder(out)
+
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    from torchfsid.results import write_json
+
+    try:
+        from experiments.sweep import sweep
+        from experiments.sweep_summary import print_sweep, summarise_sweep
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"{error}: install torchfsid[experiments]") from error
+
+    def tracked(records: Iterable[Any], total: int, finished: int) -> Iterable[Any]:
+        columns = TextColumn("Sweeping"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()
+        with Progress(*columns, console=Console(stderr=True), speed_estimate_period=600) as progress:
+            task = progress.add_task("", total=total, completed=finished)
+            for record in records:
+                yield record
+                progress.advance(task)
+
+    sweep(config, out, jobs=jobs, dask=dask, track=tracked)
+    summary = summarise_sweep(out)
+    write_json(out / "summary.json", summary)
+    _draw(out)
+    print_sweep(summary, Console(width=max(Console().width, TABLE_WIDTH)))
 
 
 def _draw(folder: Path) -> None:

@@ -47,10 +47,15 @@ class ObstacleConfig(Strict):
 
 
 class MeasurementNoiseConfig(Strict):
-    """The errors of what the observer sees of the robots: uniform in discs of these radii [m/s], [m]."""
+    """The errors of what the observer sees of the robots, of at most these lengths [m/s], [m].
+
+    `shape`: `uniform` in discs; `bias`: one error of full length per robot, the same at all times; `adversarial`: of
+    full length, chosen at every sample by somebody who knows the truth and the observer (`experiments.errors`).
+    """
 
     velocity: NonNegative = 0.0
     position: NonNegative = 0.0
+    shape: Literal["uniform", "bias", "adversarial"] = "uniform"
 
 
 class ExpectedConfig(Strict):
@@ -139,7 +144,7 @@ class SceneConfig(ExperimentConfig):
         for i, barrier in enumerate(self.barriers):
             if isinstance(barrier, AvoidanceConfig) and barrier.margin is not None:
                 raise wrong("bodies of a scene have no radius: give safety_distance", f"barriers[{i}].margin")
-        _require_increasing(self.snapshots, "snapshots")
+        require_increasing(self.snapshots, "snapshots")
         if self.snapshots[-1] > self.duration:
             raise wrong(f"must not be after the end, {self.duration} s, got {self.snapshots[-1]}", "snapshots")
         self._check_expected()
@@ -148,7 +153,7 @@ class SceneConfig(ExperimentConfig):
     def _check_expected(self) -> None:
         if self.expected and len(self.robots) > 1:
             raise wrong("only a scene of one robot has an expected timeline", "expected")
-        _require_increasing([interval.until for interval in self.expected], "expected")
+        require_increasing([interval.until for interval in self.expected], "expected")
         obstacles = [obstacle.name for obstacle in self.obstacles]
         for i, interval in enumerate(self.expected):
             if unknown := [name for name in interval.active or () if name not in obstacles]:
@@ -224,7 +229,8 @@ def load_experiment(path: str | Path, overrides: Iterable[str] = ()) -> SceneCon
     return validate(mapping, MODELS[kind], source=str(path))
 
 
-def _require_increasing(times: Sequence[float], path: str) -> None:
+def require_increasing(times: Sequence[float], path: str) -> None:
+    """Raises, in a validator, the error for times that do not."""
     for before, after in pairwise(times):
         if not before < after:
             raise wrong(f"times must increase, got {after} after {before}", path)

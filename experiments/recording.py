@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from experiments.config import SceneConfig
+from experiments.errors import measure
 from torchfsid.barriers import Barrier
 from torchfsid.controller import CbfQpController
 from torchfsid.measurement import Measurement
@@ -73,24 +73,7 @@ def simulate_scene(config: SceneConfig) -> Scene:
         steps=config.steps,
         obstacles=_points([obstacle.position for obstacle in config.obstacles]),
     )
-    return Scene(config, task, barriers, true, _measured(true, config))
-
-
-def _measured(true: Trajectory, config: SceneConfig) -> Trajectory:
-    """The trajectory with errors on the robots' positions and velocities; obstacles are known exactly."""
-    random = np.random.default_rng(np.random.SeedSequence(config.seed))
-    noise = config.measurement_noise
-    x, u = true.x.clone(), true.u.clone()
-    x[:, : true.robots] += _in_disc(random, noise.position, (len(true.t), true.robots))
-    u[:, : true.robots] += _in_disc(random, noise.velocity, (len(true.t), true.robots))
-    return replace(true, x=x, u=u)
-
-
-def _in_disc(random: np.random.Generator, radius: float, shape: tuple[int, ...]) -> Tensor:
-    """Points uniformly distributed in a disc."""
-    distance = radius * np.sqrt(random.uniform(size=shape))
-    angle = random.uniform(0, 2 * np.pi, size=shape)
-    return torch.from_numpy(np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=-1))
+    return Scene(config, task, barriers, true, measure(true, config))
 
 
 def _points(points: list[tuple[float, ...]]) -> Float[Tensor, "points 2"]:

@@ -14,18 +14,23 @@ from experiments.figures.single import draw_single
 from experiments.figures.style import STYLE
 from experiments.figures.team import draw_comparison, draw_team
 from experiments.saved import Results
+from torchfsid.documents import read_yaml
 
 
 def draw(folder: Path) -> list[Path]:
-    """Draw figure.png and figure.pdf; of a scene also animation.gif, of a team also comparison.png and comparison.pdf.
+    """Draw figure.png and figure.pdf; of a scene also animation.gif, of a team also comparison.png and comparison.pdf;
+    of a sweep with a second line in its grid, one figure per entry of that line instead.
 
     Raises:
         ConfigError: the folder has no readable config.yaml.
         OSError: another of its files cannot be read, or a figure cannot be written.
     """
-    results = Results(folder)
-    config = results.config
+    kind = read_yaml(folder / "config.yaml").get("kind")
     with mpl.rc_context(STYLE):
+        if kind == "sweep":
+            return _draw_sweep(folder)
+        results = Results(folder)
+        config = results.config
         if isinstance(config, CasesConfig):
             return _save(draw_cases(results, config), folder, "figure")
         if len(config.robots) == 1:
@@ -34,6 +39,17 @@ def draw(folder: Path) -> list[Path]:
             paths = _save(draw_team(results, config), folder, "figure")
             paths += _save(draw_comparison(results, config), folder, "comparison")
         return [*paths, animate(results, config, folder / "animation.gif")]
+
+
+def _draw_sweep(folder: Path) -> list[Path]:
+    from experiments.figures.sweep import draw_sweep
+    from experiments.swept import Swept
+
+    swept = Swept(folder)
+    if len(swept.config.axes) < 2:
+        return _save(draw_sweep(swept, None), folder, "figure")
+    figures = [(draw_sweep(swept, i), label) for i, label in enumerate(swept.labels(1))]
+    return [path for figure, label in figures for path in _save(figure, folder, f"figure_{'_'.join(label)}")]
 
 
 def _save(figure: Figure, folder: Path, name: str) -> list[Path]:

@@ -1,0 +1,99 @@
+"""A sweep: a column per entry of the first line of its grid. Does each set hold the truth; how large are sets and
+errors over time; in which of the paper's cases are the robots."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from experiments.figures.style import HYBRID, INVERSE_OPTIMAL, REGION, UKF
+from experiments.swept import Swept, short
+
+BAND = (0.1, 0.9)
+SIZES = (
+    ("inverse_optimal_sqrt_area", "inverse-optimal set", INVERSE_OPTIMAL),
+    ("critical_region_sqrt_area", "paper's region", REGION),
+)
+ERRORS = (("ukf_error", "UKF", UKF), ("hybrid_error", "hybrid", HYBRID))
+CASE_COLOURS = {"A": "#DDDDDD", "B": "#BBCCEE", "C": "#222255", "D": "#4477AA", "E": "#225522"}
+
+
+def draw_sweep(swept: Swept, second: int | None) -> Figure:
+    """`second`: entry of the grid's second line; None: there is none."""
+    labels = swept.labels(0) if swept.config.axes else [[]]
+    figure = Figure(figsize=(2.2 * len(labels) + 1.1, 7.4), layout="constrained")
+    grid = figure.subplots(4, len(labels), sharey="row", squeeze=False, height_ratios=(2, 3.2, 3.2, 0.7))
+    for column, label in enumerate(labels):
+        levels = (column, second)[: len(swept.config.axes)]
+        series, runs = swept.chosen(swept.series, levels), swept.chosen(swept.runs, levels)
+        _draw_containment(grid[0, column], series)
+        _draw_lengths(grid[1, column], series, SIZES)
+        _draw_lengths(grid[2, column], series, ERRORS)
+        _draw_cases(grid[3, column], runs)
+        grid[2, column].set_xlabel("t [s]")
+        named = [f"{short(key)} {value}" for key, value in zip(swept.telling(0), label, strict=True)] if label else []
+        robots = f"{len(runs['run'])} runs, {runs['robots'].sum():.0f} robots"
+        grid[0, column].set_title("\n".join([*named, robots]), fontsize=8.5)
+    grid[0, 0].set_ylabel("truth in the set\n[share of robots]")
+    grid[1, 0].set_ylabel("√area [m]")
+    grid[2, 0].set_ylabel("error [m]")
+    grid[3, 0].set_ylabel("time\nin case", rotation=0, ha="right", va="center")
+    told = (
+        "" if second is None else f"; {', '.join(map(short, swept.telling(1)))}: {', '.join(swept.labels(1)[second])}"
+    )
+    figure.suptitle(swept.config.title + told, fontsize=9.5, x=0.01, ha="left", fontweight="bold")
+    _add_legend(figure)
+    return figure
+
+
+def _draw_containment(axes: Axes, series: dict[str, np.ndarray]) -> None:
+    t = np.unique(series["t"])
+    for name, _, colour in SIZES:
+        kind = name.removesuffix("_sqrt_area")
+        lost, silent = series[f"{kind}_lost"] == 1, series[f"{kind}_status"] == "ok"
+        held = [1 - lost[series["t"] == at].mean() for at in t]
+        unaware = [(lost & silent)[series["t"] == at].mean() for at in t]
+        width = 3.6 if kind == "inverse_optimal" else 1.6
+        axes.plot(t, held, color=colour, lw=width, clip_on=False, zorder=3)
+        axes.plot(t, unaware, color=colour, lw=1.3, ls=(0, (1, 1)), clip_on=False)
+    axes.set(ylim=(0, 1), yticks=(0, 0.5, 1), xlim=(t[0], t[-1]))
+    axes.tick_params(labelbottom=False)
+    axes.grid(True)
+
+
+def _draw_lengths(axes: Axes, series: dict[str, np.ndarray], measures: tuple[tuple[str, str, str], ...]) -> None:
+    t = np.unique(series["t"])
+    for name, _, colour in measures:
+        values = [series[name][series["t"] == at] for at in t]
+        low, middle, high = (np.array([np.nanquantile(of, q) for of in values]) for q in (BAND[0], 0.5, BAND[1]))
+        axes.fill_between(t, low, high, color=colour, alpha=0.2, lw=0)
+        axes.semilogy(t, middle, color=colour, lw=1.8)
+    axes.set(xlim=(t[0], t[-1]))
+    axes.grid(True)
+
+
+def _draw_cases(axes: Axes, runs: dict[str, np.ndarray]) -> None:
+    left = 0.0
+    for letter, colour in CASE_COLOURS.items():
+        share = float(np.average(runs[f"case_{letter}"], weights=runs["robots"]))
+        axes.barh(0, share, left=left, color=colour, height=0.8)
+        if share > 0.04:
+            text = f"{letter} {share:.0%}" if share > 0.15 else letter
+            shade = "white" if letter in "CDE" else "0.2"
+            axes.text(left + share / 2, 0, text, ha="center", va="center", fontsize=7, color=shade)
+        left += share
+    axes.set(xlim=(0, 1), ylim=(-0.5, 0.5), yticks=(), xticks=())
+    axes.spines[:].set_visible(False)
+
+
+def _add_legend(figure: Figure) -> None:
+    lines = [(Line2D([], [], color=colour, lw=1.8), label) for _, label, colour in SIZES + ERRORS]
+    lines += [
+        (Line2D([], [], color="0.35", lw=1.3, ls=(0, (1, 1))), "truth lost, status still ok"),
+        (Patch(color="0.35", alpha=0.25, lw=0), "median and 10 % to 90 % of the robots"),
+    ]
+    handles, labels = zip(*lines, strict=True)
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(lines), columnspacing=1.5)

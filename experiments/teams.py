@@ -1,0 +1,89 @@
+"""Teams drawn at random: who starts where, and wants to go where. No torch in this module."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from torchfsid.documents import Strict, wrong
+from torchfsid.errors import ConfigError
+from torchfsid.quantities import NonNegative, Positive
+
+TRIES = 1000
+"""Places tried for a body before there is no room for it."""
+
+Robots = Annotated[int, Field(strict=True, ge=1)]
+Obstacles = Annotated[int, Field(strict=True, ge=0)]
+
+
+class TeamConfig(Strict):
+    """What a team is drawn from.
+
+    Attributes:
+        robots, obstacles: least and greatest number, both included.
+        place: `circle`: robots start on a circle and go to about the opposite point; `disc`: from anywhere to anywhere.
+            Of several, each team draws one.
+        radius: of the circle or disc; obstacles stand in its inner half [m].
+        separation: between starts and obstacles, and between goals and obstacles, at least [m].
+    """
+
+    robots: Annotated[tuple[Robots, ...], Field(min_length=2, max_length=2)]
+    obstacles: Annotated[tuple[Obstacles, ...], Field(min_length=2, max_length=2)] = (0, 0)
+    place: Annotated[tuple[Literal["circle", "disc"], ...], Field(min_length=1)]
+    radius: Positive
+    separation: NonNegative
+
+    @model_validator(mode="after")
+    def _are_ranges(self) -> TeamConfig:
+        for name, (least, greatest) in (("robots", self.robots), ("obstacles", self.obstacles)):
+            if least > greatest:
+                raise wrong(f"expected the smaller number first, got {[least, greatest]}", name)
+        return self
+
+    def draw(self, random: np.random.Generator) -> dict[str, list[dict[str, Any]]]:
+        """`robots` and `obstacles` of a scene. Raises `ConfigError` if there is no room for them."""
+        robots, obstacles = (
+            int(random.integers(least, greatest, endpoint=True)) for least, greatest in (self.robots, self.obstacles)
+        )
+        on_circle = self.place[random.integers(len(self.place))] == "circle"
+        standing: list[np.ndarray] = []
+        for _ in range(obstacles):
+            standing.append(self._apart(standing, lambda: _in_disc(random, self.radius / 2)))
+        starts, goals = list(standing), list(standing)
+        for _ in range(robots):
+            starts.append(self._apart(starts, lambda: self._start(random, on_circle)))
+            goals.append(self._apart(goals, lambda: self._goal(random, on_circle, starts[-1])))
+        pairs = zip(starts[obstacles:], goals[obstacles:], strict=True)
+        return {
+            "robots": [
+                {"name": f"r{i}", "start": start.tolist(), "goal": goal.tolist()}
+                for i, (start, goal) in enumerate(pairs, 1)
+            ],
+            "obstacles": [{"name": f"o{i}", "position": at.tolist()} for i, at in enumerate(standing, 1)],
+        }
+
+    def _start(self, random: np.random.Generator, on_circle: bool) -> np.ndarray:
+        return self.radius * _direction(random) if on_circle else _in_disc(random, self.radius)
+
+    def _goal(self, random: np.random.Generator, on_circle: bool, start: np.ndarray) -> np.ndarray:
+        return -start + _in_disc(random, self.radius / 4) if on_circle else _in_disc(random, self.radius)
+
+    def _apart(self, others: Sequence[np.ndarray], place: Callable[[], np.ndarray]) -> np.ndarray:
+        for _ in range(TRIES):
+            point = place()
+            if all(math.dist(point, other) >= self.separation for other in others):
+                return point
+        raise ConfigError(f"team: no room for {len(others) + 1} bodies {self.separation} m apart")
+
+
+def _direction(random: np.random.Generator) -> np.ndarray:
+    angle = random.uniform(0, 2 * math.pi)
+    return np.array([math.cos(angle), math.sin(angle)])
+
+
+def _in_disc(random: np.random.Generator, radius: float) -> np.ndarray:
+    return radius * math.sqrt(random.uniform()) * _direction(random)
