@@ -71,6 +71,8 @@ def _draw_map(axes: Axes, final: dict, x: np.ndarray, seen: np.ndarray, bodies: 
     for body in bodies:
         k = bodies.index(body)
         path = x[seen[:, k], k]
+        if len(path) == 0:  # its only sample was the last one, which has no difference to a next one
+            continue
         if body not in final:
             axes.plot(*path.T, color="0.75", lw=1)
             axes.plot(*path[-1], "o", color="0.6", ms=6)

@@ -6,7 +6,8 @@ ignored:
     t, robot, x, y[, z][, vx, vy[, vz]][, radius]          [s], a name, [m], [m/s], [m]
 
 (vx, vy) is the control computed at t from the positions at t. It is held until the next sample t_+ (zero-order hold):
-where it was not logged, it is (x(t_+) - x(t)) / (t_+ - t), exactly. A body without a row at t is not there at t.
+where it was not logged, it is (x(t_+) - x(t)) / (t_+ - t), exactly. A body without a row at t is not there at t; if it
+has rows before and after, see `gaps`.
 
 Nothing here imports torch before the measurements are asked for, so that a wrong log is refused at once.
 """
@@ -44,6 +45,7 @@ class Log:
         radius: [m]; None if the log has none.
         position_error, velocity_error: bounds on the errors of x [m] and u [m/s]; None: zero.
         lost: the body is there at t, but nobody knows where; None: a body that is not seen is not there.
+        bridged: the body was not measured at t, it is where it can be (see `gaps`): itself, it says nothing.
     """
 
     source: str
@@ -57,6 +59,7 @@ class Log:
     position_error: Float[np.ndarray, "times bodies"] | None = None
     velocity_error: Float[np.ndarray, "times bodies"] | None = None
     lost: Bool[np.ndarray, "times bodies"] | None = None
+    bridged: Bool[np.ndarray, "times bodies"] | None = None
 
     @property
     def previous_known(self) -> Bool[np.ndarray, "times bodies"]:
@@ -88,7 +91,7 @@ class Log:
         and the `neighbour_velocities` that its barriers use are known: for `current` the velocity of every body that is
         there, for `previous` that of every body that is there (the robot included) one sample earlier. A row with an
         unknown right-hand side cannot just be left out: it may be the active one, and the set would lose the truth. For
-        the same reason no robot is observed while a body is `lost`.
+        the same reason no robot is observed while a body is `lost`. A body that is `bridged` serves others only.
 
         Raises:
             LogError: the log has no velocities, or no body of that name.
@@ -105,6 +108,8 @@ class Log:
             observed &= (self.previous_known | ~self.seen).all(axis=1, keepdims=True)
         if self.lost is not None:
             observed &= ~self.lost.any(axis=1, keepdims=True)
+        if self.bridged is not None:
+            observed &= ~self.bridged[:, index]
         neighbour_error = self.velocity_error
         if neighbour_error is not None and "previous" in neighbour_velocities:  # one bound serves both moments
             neighbour_error = np.maximum(neighbour_error, _one_earlier(neighbour_error))

@@ -13,6 +13,7 @@ from torchfsid.config import ObserveConfig
 from torchfsid.consistency import Consistency
 from torchfsid.errors import ConfigError
 from torchfsid.feasible_set import FeasibleSet
+from torchfsid.gaps import bridged
 from torchfsid.logs import Log
 from torchfsid.measurement import Measurement
 from torchfsid.tasks import Task
@@ -27,7 +28,7 @@ class Scene:
     """A log and the declared model.
 
     Attributes:
-        log: with differences of its positions for velocities, if the configuration says so.
+        log: with differences of its positions for velocities, if the configuration says so, and without gaps (`gaps`).
         robots: the bodies to infer. task, barriers: the model. prior: the robots' prior sets.
 
     Raises:
@@ -56,6 +57,7 @@ class Scene:
             raise ConfigError(f"{self.log.source}: no two bodies share a time, so none would ever see another")
         if config.velocity == "differentiated":
             self.log = self.log.differentiated()
+        self.log = bridged(self.log)
         self.robots = config.robots(self.log.bodies)
         self.task = config.task.build(self.log.bodies)
         self.barriers = [barrier.build() for barrier in config.barriers]
@@ -102,6 +104,7 @@ class Scene:
             position_error=None if log.position_error is None else log.position_error[kept],
             velocity_error=None if log.velocity_error is None else log.velocity_error[moved],
             lost=None if log.lost is None else log.lost[kept],
+            bridged=None if log.bridged is None else log.bridged[kept] | log.bridged[moved],
         )
         return replace(self, config=self.config.model_copy(update={"velocity": "logged"}), log=shifted)
 
