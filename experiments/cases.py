@@ -27,7 +27,7 @@ from torchfsid.measurement import Measurement
 def record_cases(config: CasesConfig) -> Recording:
     """All cases as one batch of robots, each among its own bodies."""
     goals = torch.tensor(config.goal, dtype=torch.float64).expand(len(config.cases), 2)
-    controller = CbfQpController(config.task.build([]), [barrier.build() for barrier in config.barriers])
+    controller = CbfQpController(config.task.build([]), [barrier.build([]) for barrier in config.barriers])
     return Recording(
         robots=[case.name for case in config.cases],
         goals=goals,

@@ -44,7 +44,7 @@ def measure(true: Trajectory, config: SceneConfig) -> Trajectory:
 def _worst(true: Trajectory, config: SceneConfig, random: np.random.Generator) -> Trajectory:
     noise, robots = config.measurement_noise, true.robots
     goals = torch.tensor([robot.goal for robot in config.robots], dtype=torch.float64)
-    barriers: list[Barrier] = [barrier.build() for barrier in config.barriers]
+    barriers: list[Barrier] = [barrier.build(config.bodies) for barrier in config.barriers]
     compass = 2 * math.pi * torch.arange(DIRECTIONS, dtype=torch.float64) / DIRECTIONS
     # A length of zero needs no direction.
     turns = torch.cartesian_prod(compass if noise.position else compass[:1], compass if noise.velocity else compass[:1])

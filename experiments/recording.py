@@ -64,7 +64,7 @@ class Scene:
 def simulate_scene(config: SceneConfig) -> Scene:
     """Run the scene's robots in closed loop, and measure them as well as the config says."""
     task = config.task.build(config.bodies)
-    barriers: list[Barrier] = [barrier.build() for barrier in config.barriers]
+    barriers: list[Barrier] = [barrier.build(config.bodies) for barrier in config.barriers]
     true = simulate(
         CbfQpController(task, barriers),
         _points([robot.goal for robot in config.robots]),

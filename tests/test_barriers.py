@@ -5,11 +5,22 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 import torch
 from scipy.spatial import HalfspaceIntersection
 
-from torchfsid import CollisionAvoidance, FeasibleSet, GoalTask, NoiseBound, SetMembershipObserver
-from torchfsid.barriers import Arena, ClassK, SpeedPolygon
+from torchfsid import (
+    CbfQpController,
+    CollisionAvoidance,
+    FeasibleSet,
+    GoalTask,
+    NoiseBound,
+    SetMembershipObserver,
+    simulate,
+)
+from torchfsid.barriers import AffineBarrier, Arena, ClassK, SpeedPolygon
+from torchfsid.config import AvoidanceConfig, ClassKConfig
+from torchfsid.errors import ConfigError, InputError
 from torchfsid.measurement import Measurement
 
 AT_REST = Measurement.of_team(0.0, torch.zeros(1, 2), torch.zeros(1, 2))
@@ -60,3 +71,35 @@ def test_a_team_whose_joint_controller_failed_says_nothing() -> None:
     assert watching.skipped.tolist() == [1, 1, 0]
     assert watching.feasible_set.contains(x)[2]
     assert watching.feasible_set.diameter()[2] < 0.03
+
+
+def test_a_body_may_have_a_distance_of_its_own() -> None:
+    x = torch.tensor([[0.0, 0.0], [2.0, 0.0], [0.0, 3.0]], dtype=torch.float64)
+    config = AvoidanceConfig(safety_distance=0.5, safety_distances={"wide": 1.5}, class_k=ClassKConfig(gain=2.0))
+    rows = config.build(["ego", "narrow", "wide"])(Measurement.of_team(0.0, x))
+    assert rows.b[0, 1:].tolist() == [2.0 * (4.0 - 0.25), 2.0 * (9.0 - 2.25)]
+    assert rows.b[1, [0, 2]].tolist() == [2.0 * (4.0 - 0.25), 2.0 * (13.0 - 2.25)]
+    with pytest.raises(ConfigError, match=r"safety_distances\.wide: no body is called 'wide'"):
+        config.build(["ego", "narrow"])
+
+
+def test_any_rows_of_ones_own() -> None:
+    """A leash, |x - home| + u.n <= 1, written by hand, is one more barrier for robots and observers."""
+
+    def outward(measurement: Measurement) -> torch.Tensor:
+        return (measurement.x / measurement.x.norm(dim=-1, keepdim=True)).unsqueeze(-2)
+
+    leash = AffineBarrier(outward, lambda measurement: 1.0 - measurement.x.norm(dim=-1, keepdim=True), ("leash",))
+    goal = torch.tensor([[3.0, 0.4]], dtype=torch.float64)
+    run = simulate(CbfQpController(GoalTask(1.0), [leash]), goal, torch.tensor([[0.1, 0.0]]), dt=0.05, steps=100)
+    assert run.active[-1].all()
+    prior = FeasibleSet.from_box(torch.full((1, 2), -5.0), torch.full((1, 2), 5.0))
+    watching = SetMembershipObserver(GoalTask(1.0), [leash], prior, noise=NoiseBound(1e-6))
+    for measurement in run.measurements():
+        theta = watching.update(measurement).feasible_set
+        assert theta.contains(goal).all()
+    assert float(theta.diameter()) < 0.1
+    with pytest.raises(InputError, match="row_errors"):
+        SetMembershipObserver(GoalTask(1.0), [leash], prior, noise=NoiseBound(1e-6, position=0.1)).update(measurement)
+    with pytest.raises(InputError, match=r"A \(\*batch, 2, 2\)"):
+        AffineBarrier(torch.eye(1, 2), torch.zeros(1), ("one", "two"))(AT_REST)

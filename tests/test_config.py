@@ -86,7 +86,7 @@ def refusal(call) -> str:
 def test_the_sample_of_a_joint_qp():
     config = observe(text=ROBOTARIUM)
     assert config.task.build(BODIES) == GoalTask(0.11)
-    assert [barrier.build() for barrier in config.barriers] == [
+    assert [barrier.build([]) for barrier in config.barriers] == [
         CollisionAvoidance(ClassK(100.0, 3.0), safety_distance=0.15, distance="squared", neighbour_velocity="current"),
         SpeedPolygon(sides=8, limit=0.2),
     ]
@@ -99,7 +99,7 @@ def test_the_sample_of_a_joint_qp():
 
 def test_the_sample_with_radii():
     config = observe(text=IRSIM)
-    assert [barrier.build() for barrier in config.barriers] == [
+    assert [barrier.build([]) for barrier in config.barriers] == [
         CollisionAvoidance(ClassK(1.0, 1.0), margin=0.2, neighbour_velocity="previous"),
         SpeedBox((0.8, 0.8)),
     ]
@@ -143,7 +143,7 @@ BARRIERS = {
 
 @pytest.mark.parametrize("text", BARRIERS)
 def test_every_kind_of_barrier(text):
-    assert validate({"barrier": yaml.safe_load(text)}, Barrier, "cfg.yaml").barrier.build() == BARRIERS[text]
+    assert validate({"barrier": yaml.safe_load(text)}, Barrier, "cfg.yaml").barrier.build([]) == BARRIERS[text]
 
 
 def test_the_default_tolerance_is_that_of_the_active_set():
@@ -226,7 +226,7 @@ def test_dump_loads_back_to_the_same_configuration(raw, tmp_path_factory):
     path = tmp_path_factory.getbasetemp() / "resolved.yaml"
     path.write_text(dump(config), encoding="utf-8")
     assert load(path, ObserveConfig) == config
-    assert [barrier.build() for barrier in load(path, ObserveConfig).barriers] == [b.build() for b in config.barriers]
+    assert [barrier.build([]) for barrier in load(path, ObserveConfig).barriers] == [b.build([]) for b in config.barriers]
 
 
 # What is refused, and how.
@@ -430,7 +430,7 @@ def builds_or_refuses(make) -> None:
     config.task.build([*BODIES, getattr(config.task, "leader", "")])
     config.noise.build()
     for barrier in config.barriers:
-        barrier.build()
+        barrier.build([])
 
 
 @repeatable

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from torchfsid.active_set import active_set as active_set
     from torchfsid.barriers import Arena as Arena
     from torchfsid.barriers import ClassK as ClassK
+    from torchfsid.barriers import AffineBarrier as AffineBarrier
     from torchfsid.barriers import CollisionAvoidance as CollisionAvoidance
     from torchfsid.barriers import SpeedBox as SpeedBox
     from torchfsid.barriers import SpeedPolygon as SpeedPolygon
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
 
 _HOME = {
     "active_set": ["active_set"],
-    "barriers": ["Arena", "ClassK", "CollisionAvoidance", "SpeedBox", "SpeedPolygon"],
+    "barriers": ["AffineBarrier", "Arena", "ClassK", "CollisionAvoidance", "SpeedBox", "SpeedPolygon"],
     "controller": ["CbfQpController"],
     "critical_region": ["critical_region"],
     "feasible_set": ["FeasibleSet"],

@@ -14,7 +14,7 @@ halved: the same half-space, and nothing here depends on a row's scale.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
@@ -75,7 +75,8 @@ class ClassK:
 
 @dataclass(frozen=True)
 class CollisionAvoidance:
-    """One row per body: stay `safety_distance` [m] away, or radius_i + radius_j + `margin` [m].
+    """One row per body: stay `safety_distance` [m] away (a tensor (m,): from each its own), or radius_i + radius_j +
+    `margin` [m].
 
     Raises `InputError` unless exactly one of the two is given, and when `margin` meets a measurement without radii or
     `neighbour_velocity` one without the velocities it needs.
@@ -244,22 +245,55 @@ class Arena:
         return torch.cat([to_upper, to_lower], dim=-1)
 
 
+@dataclass(frozen=True)
+class AffineBarrier:
+    """Any rows A u <= b: A (m, n) and b (m,), given as tensors or as functions of the measurement.
+
+    `row_errors` says how far they may be off where positions have errors; needed only there.
+    """
+
+    A: Tensor | Callable[[Measurement], Tensor]
+    b: Tensor | Callable[[Measurement], Tensor]
+    names: tuple[str, ...]
+    soft: bool = False
+    row_errors: Callable[[Measurement, ErrorBounds], RowErrors] | None = None
+
+    def __call__(self, measurement: Measurement) -> Halfspaces:
+        A = self.A(measurement) if callable(self.A) else self.A
+        b = self.b(measurement) if callable(self.b) else self.b
+        m, (*batch, n) = len(self.names), measurement.x.shape
+        if A.shape[-2:] != (m, n) or b.shape[-1:] != (m,):
+            expected = f"A (*batch, {m}, {n}) and b (*batch, {m})"
+            raise InputError("AffineBarrier(A, b)", expected, (tuple(A.shape), tuple(b.shape)))
+        return Halfspaces(A.to(torch.float64).expand(*batch, m, n), b.to(torch.float64).expand(*batch, m))
+
+    def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
+        if self.row_errors is not None:
+            return self.row_errors(measurement, bounds)
+        if any(bool((bound > 0).any()) for bound in bounds):
+            raise InputError("AffineBarrier.row_errors", "how far the rows may be off where bodies may be", None)
+        return _exact(len(self.names), bounds)
+
+    def labels(self, bodies: Sequence[str]) -> list[str]:
+        return list(self.names)
+
+
 def is_joint(barriers: Sequence[Barrier]) -> bool:
     """Does one QP decide for the whole team, since some rows count the neighbours' current velocities?"""
     return any(isinstance(b, CollisionAvoidance) and b.neighbour_velocity == "current" for b in barriers)
 
 
 def controller_failed(
-    barriers: Sequence[Barrier], measurement: Measurement, slack: Float[Tensor, "*batch m"]
+    barriers: Sequence[Barrier], measurement: Measurement, rows: Halfspaces
 ) -> Bool[Tensor, "*batch"]:
     """Has the controller of each robot found no solution? Then it commands exactly zero, which says nothing.
 
-    A robot's own QP has failed if zero violates one of its rows: `slack` is that of its control [m/s]. A joint QP stops
-    the whole team, whichever pair is at odds, so it may have failed whenever nobody moves.
+    A robot's own QP has failed if zero violates one of its `rows`. A joint QP stops the whole team, whichever pair is
+    at odds, so it may have failed whenever nobody moves.
     """
     assert measurement.u is not None
     stopped = (measurement.u == 0).all(-1)
-    failed = stopped & (slack < 0).any(-1)
+    failed = stopped & (rows.b < 0).any(-1)
     if is_joint(barriers) and measurement.body_velocities is not None:
         others_move = (measurement.present & (measurement.body_velocities != 0).any(-1)).any(-1)
         failed = failed | (stopped & ~others_move)

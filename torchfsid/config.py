@@ -34,11 +34,15 @@ class ClassKConfig(Strict):
 
 
 class AvoidanceConfig(Strict):
-    """`CollisionAvoidance`, with `safety_distance` [m] or, when the radii are known, a `margin` [m] beyond them."""
+    """`CollisionAvoidance`, with `safety_distance` [m] or, when the radii are known, a `margin` [m] beyond them.
+
+    `safety_distances` names bodies that have a distance of their own [m].
+    """
 
     kind: Literal["avoidance"] = "avoidance"
     distance: Literal["squared", "euclidean"] = "squared"
     safety_distance: Positive | None = None
+    safety_distances: dict[BodyName, Positive] = Field(default_factory=dict)
     margin: NonNegative | None = None
     class_k: ClassKConfig
     neighbour_velocity: Literal["none", "current", "previous"] = "none"
@@ -48,15 +52,24 @@ class AvoidanceConfig(Strict):
     def _one_distance(self) -> AvoidanceConfig:
         if (self.safety_distance is None) == (self.margin is None):
             raise wrong(f"expected safety_distance or margin, got {'neither' if self.margin is None else 'both'}")
+        if self.safety_distances and self.margin is not None:
+            raise wrong(
+                "bodies have a distance of their own beside a safety_distance, not a margin", "safety_distances"
+            )
         return self
 
-    def build(self) -> Barrier:
+    def build(self, bodies: Sequence[str]) -> Barrier:
+        import torch
+
         from torchfsid.barriers import ClassK, CollisionAvoidance
 
+        for name in self.safety_distances:
+            require_body(f"safety_distances.{name}", name, bodies)
+        Ds = self.safety_distance
+        if self.safety_distances:
+            Ds = torch.tensor([self.safety_distances.get(body, Ds) for body in bodies], dtype=torch.float64)
         class_k = ClassK(self.class_k.gain, self.class_k.power)
-        return CollisionAvoidance(
-            class_k, self.safety_distance, self.margin, self.distance, self.neighbour_velocity, self.soft
-        )
+        return CollisionAvoidance(class_k, Ds, self.margin, self.distance, self.neighbour_velocity, self.soft)
 
 
 class SpeedBoxConfig(Strict):
@@ -66,7 +79,7 @@ class SpeedBoxConfig(Strict):
     limit: Annotated[tuple[Positive, ...], Field(min_length=2, max_length=2)]
     soft: Flag = False
 
-    def build(self) -> Barrier:
+    def build(self, bodies: Sequence[str]) -> Barrier:
         from torchfsid.barriers import SpeedBox
 
         return SpeedBox(self.limit, self.soft)
@@ -80,7 +93,7 @@ class SpeedPolygonConfig(Strict):
     limit: Positive
     soft: Flag = False
 
-    def build(self) -> Barrier:
+    def build(self, bodies: Sequence[str]) -> Barrier:
         from torchfsid.barriers import SpeedPolygon
 
         return SpeedPolygon(self.sides, self.limit, self.soft)
@@ -101,7 +114,7 @@ class ArenaConfig(Strict):
         _require_box(self.lower, self.upper)
         return self
 
-    def build(self) -> Barrier:
+    def build(self, bodies: Sequence[str]) -> Barrier:
         from torchfsid.barriers import Arena, ClassK
 
         class_k = ClassK(self.class_k.gain, self.class_k.power)

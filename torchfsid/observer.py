@@ -17,27 +17,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Literal
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchfsid.active_set import ACTIVE_TOLERANCE, active_set
+from torchfsid.active_set import ACTIVE_TOLERANCE
 from torchfsid.barriers import Barrier, controller_failed
-from torchfsid.compiled import array, installed, use_kernel
-from torchfsid.critical_region import FAN as CRITICAL_FAN
-from torchfsid.critical_region import critical_region
+from torchfsid.compiled import installed
 from torchfsid.errors import InconsistentError, InputError
 from torchfsid.feasible_set import FeasibleSet
-from torchfsid.halfspaces import ROUND_OFF, Halfspaces
-from torchfsid.inverse_optimal import FAN, SPREAD, NoiseBound, Uncertainty, inverse_optimal_set, per_row
-from torchfsid.kkt import ANGLE_TOLERANCE, RANK_TOLERANCE, KktSolution, solve_kkt
+from torchfsid.halfspaces import Halfspaces, finite
+from torchfsid.inverse_optimal import NoiseBound, Uncertainty
+from torchfsid.kkt import KktSolution
 from torchfsid.measurement import ErrorBounds, Measurement
+from torchfsid.reading import Bounds, Model, Reading, SetKind, read
 from torchfsid.tasks import Task
 
-SetKind = Literal["critical_region", "inverse_optimal"]
 OnInconsistent = Literal["hold", "reset", "raise"]
 
 
@@ -86,30 +83,6 @@ class SetEstimate:
     def theta(self) -> Float[Tensor, "B p"]:
         """The centroid: unlike the Chebyshev centre it does not jump along a needle."""
         return self.feasible_set.centroid()
-
-
-class Reading(NamedTuple):
-    """What one measurement says by itself.
-
-    Attributes:
-        omega: half-spaces of theta; padding where the sample is not used.
-        kkt: u* = G theta + f at the observed active set.
-        informative: the sample is used. alarmed: it is not, because a hard row is violated beyond its bound.
-        safe_controls, C, d: the model at this measurement, zeros where it could not be evaluated.
-        slack: of the measured control to every row [m/s]. excess: its violation beyond the bound, positive if there is
-            any [m/s]. hard: the rows that no controller may violate.
-    """
-
-    omega: Halfspaces
-    kkt: KktSolution
-    informative: Bool[Tensor, "B"]
-    alarmed: Bool[Tensor, "B"]
-    safe_controls: Halfspaces
-    C: Float[Tensor, "B n p"]
-    d: Float[Tensor, "B n"]
-    slack: Float[Tensor, "B m"]
-    excess: Float[Tensor, "B m"]
-    hard: Bool[Tensor, "m"]
 
 
 @dataclass
@@ -188,83 +161,20 @@ class SetMembershipObserver:
             InputError: the measurement has no velocities, or they are not finite where the robot was observed.
         """
         u, t = measurement.u, measurement.t
-        if u is None or not bool(u.isfinite().all()) or not bool(measurement.x.isfinite().all()):
+        if u is None or not finite(u, measurement.x):
             raise InputError("measurement", "finite positions and velocities", f"none or not finite at t = {t}")
         parts = [barrier(measurement) for barrier in self.barriers]
-        rows = Halfspaces.stack(parts)
         C, d = self.task(measurement)
-        evaluated = rows.b.isfinite() & rows.A.isfinite().all(-1)
-        known = C.isfinite().all(-1).all(-1) & d.isfinite().all(-1)
-        if not bool(evaluated.all() & known.all()):
-            rows = rows.where(evaluated)
-            C, d = torch.where(known[:, None, None], C, 0.0), torch.where(known[:, None], d, 0.0)
-        usable = evaluated.all(-1) & known
-        if measurement.observed is not None:
-            usable = usable & measurement.observed
-        hard = torch.cat([torch.full((part.rows,), not b.soft) for part, b in zip(parts, self.barriers, strict=True)])
-        model = rows, u.to(torch.float64), C.to(torch.float64), d.to(torch.float64)
-        uncertainty = self._uncertainty(measurement)
-        planar = rows.dim == C.shape[-1] == 2 and self.task.saturation is None
-        bounds = (self.noise.velocity, self.noise.slack) if self.noise is not None else ()
-        tensors = [bound for bound in (*(uncertainty or ()), *bounds) if isinstance(bound, Tensor)]
-        if planar and use_kernel(self.compiled, rows.A, rows.b, *model[1:], *tensors):
-            return self._read_compiled(*model, hard, usable, uncertainty)
-        return self._read(*model, hard, usable, uncertainty)
-
-    def _read(
-        self, rows: Halfspaces, u: Tensor, C: Tensor, d: Tensor, hard: Tensor, usable: Tensor, more: Uncertainty | None
-    ) -> Reading:
-        slack = rows.slack(u)
-        excess = -slack - self._slack_bound(slack, more) - rows.round_off(u)
-        failed = (u == 0).all(-1) & (slack < 0).any(-1)
-        measured = usable & ~failed
-        alarmed = measured & ((excess > 0) & hard).any(-1)
-        informative = measured & ~alarmed
-        active = active_set(rows, u, self.active_tolerance)
-        kkt = solve_kkt(rows, active, C, d)
-        if self.kind == "critical_region":
-            omega = critical_region(rows, active, C, d)
-        else:
-            assert self.noise is not None
-            saturation = self.task.saturation
-            possible = None if saturation is None else self._possible(C, d)
-            omega = inverse_optimal_set(
-                rows, u, C, d, self.noise, uncertainty=more, saturation=saturation, possible=possible
-            )
-        if not bool(informative.all()):
-            omega = omega.where(informative.unsqueeze(-1))
-        return Reading(omega, kkt, informative, alarmed, rows, C, d, slack, excess, hard)
-
-    def _read_compiled(
-        self, rows: Halfspaces, u: Tensor, C: Tensor, d: Tensor, hard: Tensor, usable: Tensor, more: Uncertainty | None
-    ) -> Reading:
-        """The same, in `reading_kernel`."""
-        from torchfsid import reading_kernel
-
-        paper = self.kind == "critical_region"
-        batch = rows.batch_shape
-        bound = self._slack_bound(rows.b, more).expand(rows.b.shape)
-        velocity = per_row(0.0 if self.noise is None else self.noise.velocity, u).squeeze(-1)
-        ball = (velocity if more is None else velocity + more.velocity + more.drift).expand(batch)
-        angles = u.new_zeros(*batch, 0) if more is None or paper else more.angle
-        turn = np.linspace(0.0, 2 * np.pi, CRITICAL_FAN if paper else FAN)
-        around = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-        tensors = (rows.A, rows.b, hard, C, d, u, usable, bound, angles, ball)
-        omega, judged, kkt = reading_kernel.read(
-            *map(array, tensors), np.array(SPREAD), around, paper, self.active_tolerance,
-            ROUND_OFF, RANK_TOLERANCE, ANGLE_TOLERANCE,
-        )  # fmt: skip
-        informative, alarmed, slack, excess = map(torch.from_numpy, judged)
-        return Reading(
-            Halfspaces(*map(torch.from_numpy, omega)),
-            KktSolution(*map(torch.from_numpy, kkt)),
-            informative, alarmed, rows, C, d, slack, excess, hard,
-        )  # fmt: skip
-
-    def _slack_bound(self, like: Tensor, more: Uncertainty | None) -> Tensor:
-        """How far from its boundary an active row may be measured [m/s]."""
-        bound = like.new_tensor([self.active_tolerance]) if self.noise is None else per_row(self.noise.slack, like)
-        return bound if more is None else bound + more.slack
+        model = Model(
+            safe_controls=Halfspaces.stack(parts),
+            hard=torch.tensor([not b.soft for part, b in zip(parts, self.barriers, strict=True) for _ in range(part.rows)]),
+            C=C.to(torch.float64),
+            d=d.to(torch.float64),
+            saturation=self.task.saturation,
+            possible=None if self.task.saturation is None else self._possible(C, d),
+        )
+        bounds = Bounds(self.noise, self._uncertainty(measurement), self.active_tolerance)
+        return read(self.kind, model, u.to(torch.float64), measurement.observed, bounds, self.compiled)
 
     def _instead(self) -> FeasibleSet:
         """What takes the place of an empty set."""

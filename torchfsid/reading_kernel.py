@@ -25,11 +25,11 @@ TURN = 2 * math.pi
 
 @compiled
 @no_type_check
-def _solve_active(A, b, active, rank_tolerance, offset, projector):
-    """A_a^+ b_a and A_a^+ A_a of the unit rows marked `active`; returns (K, rank)."""
+def _solve_active(k, A, b, active, rank_tolerance, offset, projector):
+    """A_a^+ b_a and A_a^+ A_a of the unit rows marked `active[k]`; returns (K, rank)."""
     K, p, q, r = 0, 0.0, 0.0, 0.0
     for j in range(len(b)):
-        if active[j]:
+        if active[k, j]:
             K += 1
             p, q, r = p + A[j, 0] ** 2, q + A[j, 0] * A[j, 1], r + A[j, 1] ** 2
     if K == 0:
@@ -38,30 +38,31 @@ def _solve_active(A, b, active, rank_tolerance, offset, projector):
     cos, sin = math.cos(turn), math.sin(turn)
     yy = yz = yb = ww = wb = v0 = v1 = 0.0
     for j in range(len(b)):
-        if active[j]:
+        if active[k, j]:
             y, z = cos * A[j, 0] + sin * A[j, 1], cos * A[j, 1] - sin * A[j, 0]
             yy, yz, yb = yy + y * y, yz + y * z, yb + y * b[j]
             v0, v1 = v0 + y * A[j, 0], v1 + y * A[j, 1]
     for j in range(len(b)):
-        if active[j]:
+        if active[k, j]:
             y, z = cos * A[j, 0] + sin * A[j, 1], cos * A[j, 1] - sin * A[j, 0]
             w = z - y * yz / yy
             ww, wb = ww + w * w, wb + w * b[j]
     if ww > rank_tolerance**2 * yy:
         second = wb / ww
         first = (yb - yz * second) / yy
-        offset[0], offset[1] = cos * first - sin * second, sin * first + cos * second
-        projector[0, 0] = projector[1, 1] = 1.0
+        offset[k, 0], offset[k, 1] = cos * first - sin * second, sin * first + cos * second
+        projector[k, 0, 0] = projector[k, 1, 1] = 1.0
         return K, 2
     length = math.sqrt(v0 * v0 + v1 * v1)
     v0, v1 = v0 / length, v1 / length
     yy = yb = 0.0
     for j in range(len(b)):
-        if active[j]:
+        if active[k, j]:
             y = A[j, 0] * v0 + A[j, 1] * v1
             yy, yb = yy + y * y, yb + y * b[j]
-    offset[0], offset[1] = v0 * yb / yy, v1 * yb / yy
-    projector[0, 0], projector[0, 1], projector[1, 0], projector[1, 1] = v0 * v0, v0 * v1, v0 * v1, v1 * v1
+    offset[k, 0], offset[k, 1] = v0 * yb / yy, v1 * yb / yy
+    projector[k, 0, 0], projector[k, 1, 1] = v0 * v0, v1 * v1
+    projector[k, 0, 1] = projector[k, 1, 0] = v0 * v1
     return K, 1
 
 
@@ -94,13 +95,16 @@ def _outward_normals(angle, order, K, none, around, flat, normals, generator):
             second, other = i, following
     opening, count = gap - math.pi, 0
     if opening >= -flat:
-        end = widest + 1 if widest < K - 1 else 0
-        for i in range(fan if opening > flat else 1):
-            step = i / (fan - 1)
-            direction = angle[widest] + math.pi / 2 + step * max(opening, 0.0)
-            normals[count, 0], normals[count, 1] = math.cos(direction), math.sin(direction)
-            generator[count] = order[widest if step < 0.5 else end]
-            count += 1
+        end, ray = widest + 1 if widest < K - 1 else 0, opening > flat
+        first, turn = angle[widest] + math.pi / 2, max(opening, 0.0)
+        v, w, cos, sin = math.cos(first), math.sin(first), math.cos(turn / (fan - 1)), math.sin(turn / (fan - 1))
+        for i in range(fan if ray else 1):
+            if ray and i == fan - 1:  # the two ends must be exact, those between only lie there
+                v, w = math.cos(first + turn), math.sin(first + turn)
+            normals[i, 0], normals[i, 1] = v, w
+            generator[i] = order[widest if 2 * i < fan - 1 else end]
+            v, w = v * cos - w * sin, w * cos + v * sin
+        count = fan if ray else 1
     if other >= math.pi - flat:
         direction = angle[second] + math.pi / 2
         normals[count, 0], normals[count, 1], generator[count] = math.cos(direction), math.sin(direction), order[second]
@@ -110,37 +114,40 @@ def _outward_normals(angle, order, K, none, around, flat, normals, generator):
 
 @compiled
 @no_type_check
-def _critical_region(unit, bound, active, C, d, kkt, normals, generator, count, rank_tolerance, rows):
+def _critical_region(k, unit, unit_b, C, d, kkt, normals, generator, count, rank_tolerance, row_A, row_b, row_source):
     """`critical_region`: the rows that say something."""
-    G, f, P, offset = kkt
-    row_A, row_b, row_source = rows
-    m, R, least = len(bound), 0, rank_tolerance**2
+    G, f, P, offset, active = kkt
+    m, R, least = len(unit_b), 0, rank_tolerance**2
     for j in range(m):
         p, q = unit[j, 0], unit[j, 1]
-        across = (p - p * P[0, 0] - q * P[1, 0]) ** 2 + (q - p * P[0, 1] - q * P[1, 1]) ** 2
-        if not active[j] and across > least:
-            row_A[R, 0], row_A[R, 1] = p * G[0, 0] + q * G[1, 0], p * G[0, 1] + q * G[1, 1]
-            row_b[R], row_source[R] = bound[j] - p * f[0] - q * f[1], j
+        across = (p - p * P[k, 0, 0] - q * P[k, 1, 0]) ** 2 + (q - p * P[k, 0, 1] - q * P[k, 1, 1]) ** 2
+        if not active[k, j] and across > least:
+            for i in range(2):
+                row_A[k, R, i] = p * G[k, 0, i] + q * G[k, 1, i]
+            row_b[k, R], row_source[k, R] = unit_b[j] - p * f[k, 0] - q * f[k, 1], j
             R += 1
-    for i in range(count):
-        n0, n1 = normals[i, 0], normals[i, 1]
-        p, q = n0 * P[0, 0] + n1 * P[1, 0], n0 * P[0, 1] + n1 * P[1, 1]
+    for n in range(count):
+        v, w = normals[n, 0], normals[n, 1]
+        p, q = v * P[k, 0, 0] + w * P[k, 1, 0], v * P[k, 0, 1] + w * P[k, 1, 1]
         if p * p + q * q > least:
-            row_A[R, 0], row_A[R, 1] = p * C[0, 0] + q * C[1, 0], p * C[0, 1] + q * C[1, 1]
-            row_b[R], row_source[R] = n0 * offset[0] + n1 * offset[1] - p * d[0] - q * d[1], m + generator[i]
+            for i in range(2):
+                row_A[k, R, i] = p * C[k, 0, i] + q * C[k, 1, i]
+            row_b[k, R] = v * offset[k, 0] + w * offset[k, 1] - p * d[k, 0] - q * d[k, 1]
+            row_source[k, R] = m + generator[n]
             R += 1
 
 
 @compiled
 @no_type_check
-def _inverse_optimal(m, u, ball, C, d, normals, generator, count, none, rows):
+def _inverse_optimal(k, m, u, ball, C, d, normals, generator, count, none, row_A, row_b, row_source):
     """`inverse_optimal_set`."""
-    row_A, row_b, row_source = rows
-    for i in range(count):
-        p, q = normals[i, 0], normals[i, 1]
-        row_A[i, 0], row_A[i, 1] = p * C[0, 0] + q * C[1, 0], p * C[0, 1] + q * C[1, 1]
-        row_b[i] = p * (u[0] - d[0]) + q * (u[1] - d[1]) + ball
-        row_source[i] = 2 * m if generator[i] == none else m + generator[i] % m
+    x, y, room = u[k, 0] - d[k, 0], u[k, 1] - d[k, 1], ball[k]
+    for n in range(count):
+        p, q = normals[n, 0], normals[n, 1]
+        for i in range(2):
+            row_A[k, n, i] = p * C[k, 0, i] + q * C[k, 1, i]
+        row_b[k, n] = p * x + q * y + room
+        row_source[k, n] = 2 * m if generator[n] == none else m + generator[n] % m
 
 
 @compiled
@@ -151,13 +158,14 @@ def read(
 ):  # fmt: skip
     """What a measurement of B robots says about theta, and their KKT conditions.
 
-    `observed` marks the measurements that can be used at all. `bound` (B, m) is the slack of an active row, `ball` (B,)
+    `bound` (B, m) is the slack of an active row, `ball` (B,)
     bounds the error of C theta + d - u.
     `angles` (B, m), errors of the rows' directions, turn each row by the fractions `spread`; (B, 0): there are none.
     `around` is the fan of a full turn, `paper` asks for the critical region.
 
     Returns half-spaces (A, b, source), padded; (informative, alarmed, slack, excess), as in `observer.Reading`; and
-    (G, f, projector, free, offset, active, n_active, rank, case), as in `kkt.KktSolution`.
+    (G, f, projector, free, offset, active, n_active, rank, case), as in `kkt.KktSolution`;
+    and whether all rows, C and d were finite.
     """
     B, m = b.shape
     turned = angles.shape[1] > 0 and not paper
@@ -173,34 +181,33 @@ def read(
     angle, order = np.empty(generators), np.empty(generators, np.int64)
     normals, generator = np.empty((len(around) + 1, 2)), np.empty(len(around) + 1, np.int64)
     for k in range(B):
-        usable, violated, broken = observed[k], False, False
+        usable, broken = observed[k], False
         for j in range(m):
             p, q, c = A[k, j, 0], A[k, j, 1], b[k, j]
             if not (math.isfinite(p) and math.isfinite(q) and math.isfinite(c)):
-                usable, p, q, c = False, 0.0, 0.0, 1.0
+                usable = all_known = False
+                p, q, c = 0.0, 0.0, 1.0
             is_row = p != 0 or q != 0
-            norm = math.sqrt(p * p + q * q) if is_row else 1.0
-            unit[j, 0], unit[j, 1], unit_b[j] = p / norm, q / norm, c / norm
-            s = (c - (p * u[k, 0] + q * u[k, 1])) / norm
-            room = bound[k, j] + epsilon * (abs(p * u[k, 0]) + abs(q * u[k, 1]) + abs(c)) / norm
+            scale = 1 / math.sqrt(p * p + q * q) if is_row else 1.0
+            unit[j, 0], unit[j, 1], unit_b[j] = p * scale, q * scale, c * scale
+            s = (c - (p * u[k, 0] + q * u[k, 1])) * scale
+            room = bound[k, j] + epsilon * (abs(p * u[k, 0]) + abs(q * u[k, 1]) + abs(c)) * scale
             slack[k, j], excess[k, j] = s, -s - room
             active[k, j] = is_row and abs(s) < active_tolerance
             near[j] = is_row and s <= room
-            violated = violated or s < 0
             broken = broken or (hard[j] and -s > room)
-        usable = usable and not (u[k, 0] == 0 and u[k, 1] == 0 and violated)
         alarmed[k], informative[k] = usable and broken, usable and not broken
 
-        n_active[k], rank[k] = _solve_active(unit, unit_b, active[k], rank_tolerance, offset[k], projector[k])
+        n_active[k], rank[k] = _solve_active(k, unit, unit_b, active, rank_tolerance, offset, projector)
         K = n_active[k]
         case[k] = K if K < 2 else 2 if rank[k] < 2 else 3 if K == 2 else 4
         if rank[k] < 2:
             free[k, 0, 0], free[k, 1, 1] = 1 - projector[k, 0, 0], 1 - projector[k, 1, 1]
             free[k, 0, 1], free[k, 1, 0] = -projector[k, 0, 1], -projector[k, 1, 0]
         for i in range(2):
-            f[k, i] = offset[k, i] + free[k, i, 0] * d[k, 0] + free[k, i, 1] * d[k, 1]
-            for j in range(2):
-                G[k, i, j] = free[k, i, 0] * C[k, 0, j] + free[k, i, 1] * C[k, 1, j]
+            f[k, i] = offset[k, i] + free[k, i, 0] * d0 + free[k, i, 1] * d1
+            G[k, i, 0] = free[k, i, 0] * c0 + free[k, i, 1] * c2
+            G[k, i, 1] = free[k, i, 0] * c1 + free[k, i, 1] * c3
         if not informative[k]:
             continue
 
@@ -213,14 +220,15 @@ def read(
                         angle[K] = (angle[K] + spread[turn] * angles[k, j] + math.pi) % TURN - math.pi
                     K += 1
         count = _outward_normals(angle, order, K, generators, around, flat, normals, generator)
-        rows = row_A[k], row_b[k], row_source[k]
+        rows = row_A, row_b, row_source
         if paper:
-            kkt = G[k], f[k], projector[k], offset[k]
-            _critical_region(unit, unit_b, active[k], C[k], d[k], kkt, normals, generator, count, rank_tolerance, rows)
+            kkt = G, f, projector, offset, active
+            _critical_region(k, unit, unit_b, C, d, kkt, normals, generator, count, rank_tolerance, *rows)
         else:
-            _inverse_optimal(m, u[k], ball[k], C[k], d[k], normals, generator, count, generators, rows)
+            _inverse_optimal(k, m, u, ball, C, d, normals, generator, count, generators, *rows)
     return (
         (row_A, row_b, row_source),
         (informative, alarmed, slack, excess),
         (G, f, projector, free, offset, active, n_active, rank, case),
+        all_known,
     )

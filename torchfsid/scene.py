@@ -60,7 +60,7 @@ class Scene:
         self.log = bridged(self.log)
         self.robots = config.robots(self.log.bodies)
         self.task = config.task.build(self.log.bodies)
-        self.barriers = [barrier.build() for barrier in config.barriers]
+        self.barriers = [barrier.build(self.log.bodies) for barrier in config.barriers]
         lower, upper = (
             torch.tensor(bound, dtype=torch.float64).expand(len(self.robots), -1)
             for bound in (config.prior.lower, config.prior.upper)

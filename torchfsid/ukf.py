@@ -209,7 +209,7 @@ class ParameterUkf:
         d = torch.where(known[:, None], d, 0.0).to(torch.float64)
         u = torch.where(known[:, None], measurement.u, 0.0).to(torch.float64)
         slack = safe_controls.slack(u)
-        failed = controller_failed(self.barriers, measurement, slack)
+        failed = controller_failed(self.barriers, measurement, safe_controls)
         known = (known & ~failed & (slack >= -self.active_tolerance).all(-1)).tolist()
         clip = self.task.saturation
         if self.qp_inside:
