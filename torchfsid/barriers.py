@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchfsid.errors import InputError
-from torchfsid.halfspaces import Halfspaces
+from torchfsid.halfspaces import Halfspaces, dot
 from torchfsid.measurement import ErrorBounds, Measurement
 
 
@@ -99,8 +99,8 @@ class CollisionAvoidance:
         present = measurement.present
         away = measurement.x.unsqueeze(-2) - measurement.bodies
         # Slots that hold no body get a harmless vector, so that norms and their gradients stay finite.
-        away = torch.where(present.unsqueeze(-1), away, 1.0)
-        squared_distance = away.square().sum(-1)
+        away = away if bool(present.all()) else torch.where(present.unsqueeze(-1), away, 1.0)
+        squared_distance = dot(away, away)
         Ds = self._safety_distance(measurement)
         if self.distance == "squared":
             h, gradient = squared_distance - Ds**2, 2 * away
@@ -109,7 +109,7 @@ class CollisionAvoidance:
             h, gradient = distance - Ds, away / distance.unsqueeze(-1)
         b = self.class_k(h)
         if self.neighbour_velocity != "none":
-            b = b - (gradient * self._neighbours(measurement)).sum(-1)
+            b = b - dot(gradient, self._neighbours(measurement))
         return Halfspaces(-gradient, b).where(present)
 
     def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
@@ -293,6 +293,8 @@ def controller_failed(
     """
     assert measurement.u is not None
     stopped = (measurement.u == 0).all(-1)
+    if not bool(stopped.any()):
+        return stopped
     failed = stopped & (rows.b < 0).any(-1)
     if is_joint(barriers) and measurement.body_velocities is not None:
         others_move = (measurement.present & (measurement.body_velocities != 0).any(-1)).any(-1)

@@ -35,7 +35,7 @@ def use_kernel(compiled: bool | None, *tensors: Tensor) -> bool:
         obstacle = "numba is not installed (pip install 'torchfsid[fast]')"
     elif torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
         obstacle = "gradients are required"
-    elif any(tensor.device.type != "cpu" for tensor in tensors):
+    elif not all(tensor.is_cpu for tensor in tensors):
         obstacle = "tensors are not on the CPU"
     if compiled and obstacle is not None:
         raise InputError("compiled", "False or None", f"True, but {obstacle}")
@@ -44,4 +44,4 @@ def use_kernel(compiled: bool | None, *tensors: Tensor) -> bool:
 
 def array(tensor: Tensor) -> np.ndarray:
     """The tensor as the kernels take it: contiguous, without a copy if it is."""
-    return tensor.detach().contiguous().numpy()
+    return (tensor.detach() if tensor.requires_grad else tensor).contiguous().numpy()

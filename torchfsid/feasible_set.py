@@ -11,6 +11,7 @@ the order of the half-spaces does not matter; it takes the memory of its facets,
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
@@ -19,7 +20,7 @@ from torch import Tensor
 
 from torchfsid.clipping import Outcome, clip
 from torchfsid.errors import InputError
-from torchfsid.halfspaces import ROUND_OFF, Halfspaces
+from torchfsid.halfspaces import ROUND_OFF, Halfspaces, finite
 from torchfsid.polygon import Polygon
 from torchfsid.polytope import Polytope, clip_polytope, merge_polytope
 
@@ -107,6 +108,11 @@ class FeasibleSet:
     def is_empty(self) -> Bool[Tensor, "*batch"]:
         return self.outcome == Outcome.EMPTY
 
+    @cached_property
+    def any_empty(self) -> bool:
+        """Is any of the sets empty?"""
+        return bool(self.is_empty.any())
+
     def intersect(
         self,
         halfspaces: Halfspaces,
@@ -126,16 +132,17 @@ class FeasibleSet:
         if halfspaces.dim != p or not _fits(halfspaces.batch_shape, self.batch_shape):
             expected = f"rows over R^{p} for a batch {tuple(self.batch_shape)}"
             raise InputError("halfspaces", expected, (tuple(halfspaces.A.shape), tuple(halfspaces.b.shape)))
-        if not bool(halfspaces.A.isfinite().all() & halfspaces.b.isfinite().all()):
+        if not finite(halfspaces.A, halfspaces.b):
             raise InputError("halfspaces", "finite rows", "NaN or infinity")
+        if self.any_empty:
+            halfspaces = halfspaces.where(~self.is_empty.unsqueeze(-1))
         source = torch.arange(m, device=self.outcome.device) if halfspaces.source is None else halfspaces.source
-        halfspaces = halfspaces.where(~self.is_empty.unsqueeze(-1))
         stamp = torch.as_tensor(time, dtype=torch.float64, device=self.outcome.device).expand(self.batch_shape)
         rows = (
-            halfspaces.A.expand(*self.batch_shape, m, p).reshape(-1, m, p),
-            halfspaces.b.expand(*self.batch_shape, m).reshape(-1, m),
-            stamp.reshape(-1),
-            source.expand(*self.batch_shape, m).reshape(-1, m),
+            self._flat(halfspaces.A, (m, p)),
+            self._flat(halfspaces.b, (m,)),
+            self._flat(stamp, ()),
+            self._flat(source, (m,)),
         )
         if p == 2:
             clipped: Any = clip(self.body, *rows, self.max_facets, compiled)
@@ -143,20 +150,17 @@ class FeasibleSet:
         else:
             clipped = clip_polytope(self.body, *rows)
             body, shrunk = _merged(self.body, clipped.body, clipped.shrunk, self.max_facets)
-        shape = self.batch_shape
-        found = clipped.contradiction
-        fresh = Facets(
-            Halfspaces(found.A.reshape(*shape, p + 1, p), found.b.reshape(*shape, p + 1)),
-            found.time.reshape((*shape, p + 1)),
-            found.source.reshape((*shape, p + 1)),
-        )
-        return replace(
-            self,
-            body=body,
-            outcome=torch.maximum(self.outcome, clipped.outcome.reshape(shape)),
-            contradiction=_choose(self.is_empty, self.contradiction, fresh),
-            last_cut=torch.where(shrunk.reshape(shape), stamp, self.last_cut),
-        )
+        if body is self.body and not bool(clipped.outcome.any()):
+            return self
+        shape, against = self.batch_shape, self.contradiction
+        outcome = torch.maximum(self.outcome, clipped.outcome.reshape(shape))
+        if bool((clipped.outcome == Outcome.EMPTY).any()):
+            found = clipped.contradiction
+            rows = Halfspaces(found.A.reshape(*shape, p + 1, p), found.b.reshape(*shape, p + 1))
+            fresh = Facets(rows, found.time.reshape((*shape, p + 1)), found.source.reshape((*shape, p + 1)))
+            against = _choose(self.is_empty, against, fresh)
+        last_cut = torch.where(shrunk.reshape(shape), stamp, self.last_cut)
+        return replace(self, body=body, outcome=outcome, contradiction=against, last_cut=last_cut)
 
     def where(self, mask: Bool[Tensor, "*batch"], other: FeasibleSet) -> FeasibleSet:
         """This set where `mask`, `other` elsewhere."""
@@ -242,6 +246,12 @@ class FeasibleSet:
             metric = metric.to(torch.float64).expand(*self.batch_shape, p, p).reshape(-1, p, p)
         flat = point.to(torch.float64).expand(*self.batch_shape, p).reshape(-1, p)
         return self._batched(self.body.nearest(flat, metric))
+
+    def _flat(self, rows: Tensor, shape: tuple[int, ...]) -> Tensor:
+        """One item of this shape for each set, the batch flattened."""
+        expanded = (*self.batch_shape, *shape)
+        rows = rows if rows.shape == expanded else rows.expand(expanded)
+        return rows if len(self.batch_shape) == 1 else rows.reshape(-1, *shape)
 
     def _batched(self, flat: Tensor) -> Tensor:
         return flat.reshape((*self.batch_shape, *flat.shape[1:]))

@@ -8,6 +8,7 @@ Rows may carry a `source`, an integer that says which constraint each came from;
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -45,12 +46,14 @@ class Halfspaces:
             A, b = A.expand(*batch, *A.shape[-2:]), b.expand(*batch, b.shape[-1])
         object.__setattr__(self, "A", A.to(torch.float64))
         object.__setattr__(self, "b", b.to(torch.float64))
-        if self.source is not None:
+        if self.source is not None and self.source.shape != b.shape:
             object.__setattr__(self, "source", self.source.expand(self.b.shape))
 
     @classmethod
     def stack(cls, parts: Sequence[Halfspaces]) -> Halfspaces:
         """The intersection of several, their rows one below the other; batches broadcast."""
+        if len(parts) == 1:
+            return parts[0]
         batch = np.broadcast_shapes(*(part.batch_shape for part in parts))
         sources = [part.source.expand(*batch, part.rows) for part in parts if part.source is not None]
         return cls(
@@ -78,11 +81,13 @@ class Halfspaces:
 
     def where(self, keep: Bool[Tensor, "*batch m"]) -> Halfspaces:
         """The rows marked `keep`; the others become padding 0.z <= 1."""
+        if bool(keep.all()):
+            return self
         return Halfspaces(torch.where(keep.unsqueeze(-1), self.A, 0.0), torch.where(keep, self.b, 1.0), self.source)
 
     def norms(self) -> Float[Tensor, "*batch m"]:
         """|a_j|, with 1 for padding rows, so that dividing by it is always safe (and so is its gradient)."""
-        squared = _dot(self.A, self.A)
+        squared = dot(self.A, self.A)
         padding = squared == 0
         return torch.where(padding, 1.0, squared.masked_fill(padding, 1.0).sqrt())
 
@@ -93,11 +98,11 @@ class Halfspaces:
 
     def slack(self, z: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch m"]:
         """(b_j - a_j.z)/|a_j|: the signed distance of z to each boundary, positive inside, in the units of z."""
-        return (self.b - _dot(self.A, z.to(torch.float64).unsqueeze(-2))) / self.norms()
+        return (self.b - dot(self.A, z.to(torch.float64).unsqueeze(-2))) / self.norms()
 
     def round_off(self, z: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch m"]:
         """What floating point leaves open about `slack(z)`, in the units of z."""
-        sizes = _dot(self.A.abs(), z.abs().to(torch.float64).unsqueeze(-2)) + self.b.abs()
+        sizes = dot(self.A.abs(), z.abs().to(torch.float64).unsqueeze(-2)) + self.b.abs()
         return (ROUND_OFF * sizes / self.norms()).detach()
 
     def contains(self, z: Float[Tensor, "*batch n"], tolerance: float = 0.0) -> Bool[Tensor, "*batch"]:
@@ -105,7 +110,12 @@ class Halfspaces:
         return (self.slack(z) >= -tolerance).all(-1)
 
 
-def _dot(v: Float[Tensor, "*#batch n"], w: Float[Tensor, "*#batch n"]) -> Float[Tensor, "*#batch"]:
+def dot(v: Float[Tensor, "*#batch n"], w: Float[Tensor, "*#batch n"]) -> Float[Tensor, "*#batch"]:
     """v.w, faster than a product of many small matrices, and rounded alike in every batch."""
     products = (v * w).unbind(-1) if v.shape[-1] else (torch.zeros_like(v).sum(-1),)
     return sum(products[1:], start=products[0])
+
+
+def finite(*tensors: Tensor) -> bool:
+    """Are all numbers finite? Their sum is, unless it overflows."""
+    return all(math.isfinite(float(t.detach().sum())) or bool(t.isfinite().all()) for t in tensors)

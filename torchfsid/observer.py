@@ -97,8 +97,8 @@ class SetMembershipObserver:
         active_tolerance: when a row counts as active for `critical_region`, for the case label and for (G, f) [m/s].
         on_inconsistent: what an empty intersection does: `hold` the set as it was, `reset` it to the prior and go on
             from there (a change of goal; the status stays OK, the event is recorded), or `raise` an `InconsistentError`.
-        compiled: run in the compiled kernels (extra `fast`); None: wherever they can, which is where no gradient is needed
-            and theta is planar; the sets are the same up to round-off.
+        compiled: use the compiled kernels (extra `fast`); None: wherever they can, that is where theta is planar and no
+            gradient is needed. The sets are the same up to round-off.
         status, skipped, events: per robot: `Status`, number of samples without information, first ALARM and
         INCONSISTENT.
 
@@ -129,6 +129,8 @@ class SetMembershipObserver:
             raise InputError("noise", "a NoiseBound, since the set is inverse_optimal", None)
         if self.kind == "critical_region" and self.task.saturation is not None:
             raise InputError("kind", "inverse_optimal, since the nominal control is clipped", self.kind)
+        if not self.active_tolerance > 0:
+            raise InputError("active_tolerance", "a positive speed [m/s]", self.active_tolerance)
         if self.compiled and not (p == 2 and self.task.saturation is None and installed()):
             expected = "None or False unless theta is planar, nothing is clipped and numba is installed"
             raise InputError("compiled", expected, True)
@@ -146,12 +148,12 @@ class SetMembershipObserver:
         reading, t = self.read(measurement), measurement.t
         narrowed = self.feasible_set.intersect(reading.omega, t, self.compiled)
         informative = reading.informative
-        if bool(reading.alarmed.any()) or bool(narrowed.is_empty.any()):
+        if narrowed.any_empty or bool(reading.alarmed.any()):
             self._report(t, reading.alarmed, reading.slack, narrowed)
             informative = informative & ~narrowed.is_empty
             narrowed = narrowed.where(~narrowed.is_empty, self._instead())
         self.feasible_set = narrowed
-        self.skipped = self.skipped + (~reading.informative).long()
+        self.skipped = self.skipped + ~reading.informative
         return SetEstimate(t, self.feasible_set, reading.kkt, informative, self.status)
 
     def read(self, measurement: Measurement) -> Reading:
@@ -167,14 +169,19 @@ class SetMembershipObserver:
         C, d = self.task(measurement)
         model = Model(
             safe_controls=Halfspaces.stack(parts),
-            hard=torch.tensor([not b.soft for part, b in zip(parts, self.barriers, strict=True) for _ in range(part.rows)]),
+            hard=torch.tensor(
+                [not b.soft for part, b in zip(parts, self.barriers, strict=True) for _ in range(part.rows)]
+            ),
             C=C.to(torch.float64),
             d=d.to(torch.float64),
             saturation=self.task.saturation,
             possible=None if self.task.saturation is None else self._possible(C, d),
         )
+        usable = ~controller_failed(self.barriers, measurement, model.safe_controls)
+        if measurement.observed is not None:
+            usable = usable & measurement.observed
         bounds = Bounds(self.noise, self._uncertainty(measurement), self.active_tolerance)
-        return read(self.kind, model, u.to(torch.float64), measurement.observed, bounds, self.compiled)
+        return read(self.kind, model, u.to(torch.float64), usable, bounds, self.compiled)
 
     def _instead(self) -> FeasibleSet:
         """What takes the place of an empty set."""

@@ -19,30 +19,48 @@ import numpy as np
 from numba import njit
 
 compiled = njit(cache=True, error_model="numpy", nogil=True)  # no_type_check: these must stay plain functions
+# Minima and maxima of finite numbers, in any order.
+ordered = njit(cache=True, error_model="numpy", nogil=True, fastmath={"nnan", "nsz"})
 
 NONEMPTY, UNDECIDED, EMPTY = 0, 1, 2  # `clipping.Outcome`
 
 
+@ordered
+@no_type_check
+def _box(vertices, k, n):
+    x0 = x1 = vertices[k, 0, 0]
+    y0 = y1 = vertices[k, 0, 1]
+    for i in range(1, n):
+        x, y = vertices[k, i, 0], vertices[k, i, 1]
+        x0, x1 = x if x < x0 else x0, x if x > x1 else x1
+        y0, y1 = y if y < y0 else y0, y if y > y1 else y1
+    return x0, x1, y0, y1
+
+
+@ordered
+@no_type_check
+def _beyond(vertices, k, n, p, q, c):
+    """How far the vertices reach beyond the line (p, q).z = c."""
+    most = -np.inf
+    for i in range(n):
+        beyond = p * vertices[k, i, 0] + q * vertices[k, i, 1] - c
+        most = beyond if beyond > most else most
+    return most
+
+
 @compiled
 @no_type_check
-def _any_cuts(vertices, n, reach, A, b, tolerance, cutting, epsilon):
-    """Mark the rows that some vertex exceeds by more than round-off; the bounding box spares most of them the loop."""
-    x0 = x1 = vertices[0, 0]
-    y0 = y1 = vertices[0, 1]
-    for i in range(1, n):
-        x0, x1 = min(x0, vertices[i, 0]), max(x1, vertices[i, 0])
-        y0, y1 = min(y0, vertices[i, 1]), max(y1, vertices[i, 1])
+def _any_cuts(vertices, k, n, reach, A, b, tolerance, cutting, epsilon):
+    """Mark the rows that some vertex exceeds by more than round-off; the bounding box spares many of them the loop."""
+    x0, x1, y0, y1 = _box(vertices, k, n)
     found = False
-    for r in range(len(b)):
-        p, q, c = A[r, 0], A[r, 1], b[r]
-        tolerance[r] = epsilon * (abs(p) * reach[0] + abs(q) * reach[1] + abs(c))
+    for r in range(b.shape[1]):
+        p, q, c = A[k, r, 0], A[k, r, 1], b[k, r]
         cutting[r] = False
         if p * (x1 if p > 0 else x0) + q * (y1 if q > 0 else y0) - c > 0:
-            for i in range(n):
-                if p * vertices[i, 0] + q * vertices[i, 1] - c > tolerance[r]:
-                    cutting[r] = True
-                    found = True
-                    break
+            tolerance[r] = epsilon * (abs(p) * reach[k, 0] + abs(q) * reach[k, 1] + abs(c))
+            cutting[r] = _beyond(vertices, k, n, p, q, c) > tolerance[r]
+            found = found or cutting[r]
     return found
 
 
@@ -195,16 +213,14 @@ def _no_contradiction(B):
 @compiled
 @no_type_check
 def _clip_one(k, given, result, fresh, A, b, stamp, source, most, epsilon, parallel, scratch, found):
-    """Clip polygon k by its rows and merge what is beyond `most` edges.
+    """Clip polygon k by the rows marked in the scratch and merge what is beyond `most` edges.
 
     `result` is `given` itself until the first polygon is really cut; then it is a `fresh` copy, which grows on demand.
     `found` = (A, b, time, source) takes the rows of a contradiction. Returns (result, outcome, shrunk).
     """
-    vertices, ring_A, ring_b, time, ring_source, count, reach = given
+    vertices, ring_A, ring_b, time, ring_source, count, _ = given
     tolerance, cutting, ring, edge, over, spare, spare_edge, lines = scratch
     n, V, R = count[k], ring_b.shape[1], len(b)
-    if not _any_cuts(vertices[k], n, reach[k], A, b, tolerance, cutting, epsilon):
-        return result, NONEMPTY, False
     for i in range(n):
         ring[i, 0], ring[i, 1], edge[i] = vertices[k, i, 0], vertices[k, i, 1], i
     n, outcome, shrunk, row, before, after = _clip_ring(
@@ -255,11 +271,14 @@ def clip(polygons, A, b, stamp, source, most, epsilon, parallel):
     B, R = b.shape
     result, scratch, found = polygons, _scratch(polygons[2].shape[1], R), _no_contradiction(B)
     outcome, shrunk, fresh = np.empty(B, np.int64), np.empty(B, np.bool_), False
+    vertices, count, reach, tolerance, cutting = polygons[0], polygons[5], polygons[6], scratch[0], scratch[1]
     for k in range(B):
-        result, outcome[k], shrunk[k] = _clip_one(
-            k, polygons, result, fresh, A[k], b[k], stamp[k], source[k], most, epsilon, parallel, scratch, found
-        )
-        fresh = fresh or shrunk[k]
+        outcome[k], shrunk[k] = NONEMPTY, False
+        if _any_cuts(vertices, k, count[k], reach, A, b, tolerance, cutting, epsilon):
+            result, outcome[k], shrunk[k] = _clip_one(
+                k, polygons, result, fresh, A[k], b[k], stamp[k], source[k], most, epsilon, parallel, scratch, found
+            )
+            fresh = fresh or shrunk[k]
     return result, outcome, shrunk, found
 
 

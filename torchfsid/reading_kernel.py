@@ -1,6 +1,6 @@
 r"""One measurement of many robots in scalar code: slacks, KKT conditions and half-spaces, compiled by numba.
 
-What `observer.read`, `kkt`, `critical_region` and `inverse_optimal` do in torch, one robot after the other; they are the
+What `reading`, `kkt`, `critical_region` and `inverse_optimal` do in torch, one robot after the other; they are the
 reference, tests compare the two. The active rows are solved as there: with V a rotation to the principal axes of the
 unit active rows A_a, the columns of A_a V = [y z] are orthogonal up to round-off, w = z - y (y.z)/(y.y) has the length
 of the second singular value, and
@@ -141,7 +141,7 @@ def _critical_region(k, unit, unit_b, C, d, kkt, normals, generator, count, rank
 @no_type_check
 def _inverse_optimal(k, m, u, ball, C, d, normals, generator, count, none, row_A, row_b, row_source):
     """`inverse_optimal_set`."""
-    x, y, room = u[k, 0] - d[k, 0], u[k, 1] - d[k, 1], ball[k]
+    x, y, room = u[k, 0] - d[k, 0], u[k, 1] - d[k, 1], ball[min(k, len(ball) - 1)]
     for n in range(count):
         p, q = normals[n, 0], normals[n, 1]
         for i in range(2):
@@ -158,14 +158,13 @@ def read(
 ):  # fmt: skip
     """What a measurement of B robots says about theta, and their KKT conditions.
 
-    `bound` (B, m) is the slack of an active row, `ball` (B,)
-    bounds the error of C theta + d - u.
-    `angles` (B, m), errors of the rows' directions, turn each row by the fractions `spread`; (B, 0): there are none.
-    `around` is the fan of a full turn, `paper` asks for the critical region.
+    `bound` (B or 1, m or 1) is the slack of an active row, `ball` (B or 1,) bounds the error of C theta + d - u. `angles`
+    (B, m), errors of the rows' directions, turn each row by the fractions `spread`; (B, 0): there are none. `around`
+    is the fan of a full turn, `paper` asks for the critical region.
 
-    Returns half-spaces (A, b, source), padded; (informative, alarmed, slack, excess), as in `observer.Reading`; and
-    (G, f, projector, free, offset, active, n_active, rank, case), as in `kkt.KktSolution`;
-    and whether all rows, C and d were finite.
+    Returns half-spaces (A, b, source), padded; (informative, alarmed, slack, excess), as in `reading.Reading`; (G,
+    f, projector, free, offset, active, n_active, rank, case), as in `kkt.KktSolution`; and whether all rows, C and d
+    are finite.
     """
     B, m = b.shape
     turned = angles.shape[1] > 0 and not paper
@@ -180,8 +179,14 @@ def read(
     unit, unit_b, near = np.zeros((m, 2)), np.empty(m), np.empty(m, np.bool_)
     angle, order = np.empty(generators), np.empty(generators, np.int64)
     normals, generator = np.empty((len(around) + 1, 2)), np.empty(len(around) + 1, np.int64)
+    all_known = True
     for k in range(B):
         usable, broken = observed[k], False
+        c0, c1, c2, c3, d0, d1 = C[k, 0, 0], C[k, 0, 1], C[k, 1, 0], C[k, 1, 1], d[k, 0], d[k, 1]
+        known = math.isfinite(c0) and math.isfinite(c1) and math.isfinite(c2) and math.isfinite(c3)
+        if not (known and math.isfinite(d0) and math.isfinite(d1)):
+            usable = all_known = False
+            c0 = c1 = c2 = c3 = d0 = d1 = 0.0
         for j in range(m):
             p, q, c = A[k, j, 0], A[k, j, 1], b[k, j]
             if not (math.isfinite(p) and math.isfinite(q) and math.isfinite(c)):
@@ -191,7 +196,8 @@ def read(
             scale = 1 / math.sqrt(p * p + q * q) if is_row else 1.0
             unit[j, 0], unit[j, 1], unit_b[j] = p * scale, q * scale, c * scale
             s = (c - (p * u[k, 0] + q * u[k, 1])) * scale
-            room = bound[k, j] + epsilon * (abs(p * u[k, 0]) + abs(q * u[k, 1]) + abs(c)) * scale
+            room = bound[min(k, len(bound) - 1), min(j, bound.shape[1] - 1)]
+            room += epsilon * (abs(p * u[k, 0]) + abs(q * u[k, 1]) + abs(c)) * scale
             slack[k, j], excess[k, j] = s, -s - room
             active[k, j] = is_row and abs(s) < active_tolerance
             near[j] = is_row and s <= room
