@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from torchfsid.inverse_optimal import inverse_optimal_set as inverse_optimal_set
     from torchfsid.kkt import solve_kkt as solve_kkt
     from torchfsid.measurement import Measurement as Measurement
+    from torchfsid.neighbours import nearest_bodies as nearest_bodies
     from torchfsid.observer import SetMembershipObserver as SetMembershipObserver
     from torchfsid.simulation import simulate as simulate
     from torchfsid.tasks import AffineTask as AffineTask
@@ -51,6 +52,7 @@ _HOME = {
     "inverse_optimal": ["NoiseBound", "inverse_optimal_set"],
     "kkt": ["solve_kkt"],
     "measurement": ["Measurement"],
+    "neighbours": ["nearest_bodies"],
     "observer": ["SetMembershipObserver"],
     "simulation": ["simulate"],
     "tasks": [

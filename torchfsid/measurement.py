@@ -2,6 +2,7 @@
 
 A batch of B robots looks at the same M bodies: slot j is body j for every robot, and a mask says which bodies are there
 and are not the robot itself. So a team of N robots is a batch of N with M = N slots, and no index list is ever needed.
+In a fleet that would be N^2 rows: there each robot has the slots of its M nearest bodies (`neighbours`).
 """
 
 from __future__ import annotations
@@ -15,6 +16,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchfsid.errors import InputError
+
+
+class LeftOut(NamedTuple):
+    """Bodies without a slot: none is nearer than `distance` [m] (infinite: there are none), faster than `speed` [m/s]
+    or larger than `radius` [m]; NaN where unknown."""
+
+    distance: Float[Tensor, "*batch"]
+    speed: Float[Tensor, "*batch"]
+    radius: Float[Tensor, "*batch"]
 
 
 @dataclass(frozen=True)
@@ -33,6 +43,7 @@ class Measurement:
         observed: the robot was measured at t (None: all were). Where False, x and u are zeros, never NaN.
         position_error, body_position_error: bounds on the error of x and of bodies at this instant [m]; None: zero.
         velocity_error, body_velocity_error: likewise of u and of the bodies' velocities [m/s].
+        left_out: the bodies without a slot (None: all have one). Samples that they could matter for are not used.
     """
 
     t: float
@@ -49,6 +60,7 @@ class Measurement:
     body_position_error: Float[Tensor, "*batch m"] | None = None
     velocity_error: Float[Tensor, "*batch"] | None = None
     body_velocity_error: Float[Tensor, "*batch m"] | None = None
+    left_out: LeftOut | None = None
 
     @classmethod
     def of_team(

@@ -8,7 +8,7 @@ What can go wrong with data is reported, never hidden in the set:
       that robots change their minds, the set starts again from the prior;
     - a hard row violated by more than its bound: model or bounds are wrong, the sample is not used, status ALARM;
     - a controller that failed (it commands exactly zero, see `controller_failed`), a robot or a neighbour's velocity
-      not measured: the sample says nothing, it is skipped and counted.
+      not measured, a body left out that could matter (`neighbours`): the sample says nothing, is skipped and counted.
 """
 
 from __future__ import annotations
@@ -29,9 +29,10 @@ from torchfsid.compiled import installed
 from torchfsid.errors import InconsistentError, InputError
 from torchfsid.feasible_set import FeasibleSet
 from torchfsid.halfspaces import Halfspaces, finite
-from torchfsid.inverse_optimal import NoiseBound, Uncertainty
+from torchfsid.inverse_optimal import NoiseBound, Uncertainty, per_row
 from torchfsid.kkt import KktSolution
 from torchfsid.measurement import ErrorBounds, Measurement
+from torchfsid.neighbours import left_out_inactive
 from torchfsid.reading import Bounds, Model, Reading, SetKind, read
 from torchfsid.tasks import Task
 
@@ -96,7 +97,7 @@ class SetMembershipObserver:
         noise: bounds for `inverse_optimal` and for the alarm.
         active_tolerance: when a row counts as active for `critical_region`, for the case label and for (G, f) [m/s].
         on_inconsistent: what an empty intersection does: `hold` the set as it was, `reset` it to the prior and go on
-            from there (a change of goal; the status stays OK, the event is recorded), or `raise` an `InconsistentError`.
+            from there (a change of goal; the status stays OK, the event is recorded), or `raise` `InconsistentError`.
         compiled: use the compiled kernels (extra `fast`); None: wherever they can, that is where theta is planar and no
             gradient is needed. The sets are the same up to round-off.
         status, skipped, events: per robot: `Status`, number of samples without information, first ALARM and
@@ -181,7 +182,20 @@ class SetMembershipObserver:
         if measurement.observed is not None:
             usable = usable & measurement.observed
         bounds = Bounds(self.noise, self._uncertainty(measurement), self.active_tolerance)
+        if measurement.left_out is not None:
+            usable = usable & self._complete(measurement)
         return read(self.kind, model, u.to(torch.float64), usable, bounds, self.compiled)
+
+    def _complete(self, measurement: Measurement) -> Bool[Tensor, "B"]:
+        """Are all rows that may be active among the measurement's slots?"""
+        noise = NoiseBound(self.active_tolerance) if self.noise is None else self.noise
+        bound = per_row(noise.slack, measurement.x).squeeze(-1) + noise.neighbour_velocity
+        if measurement.velocity_error is not None:
+            bound = bound + measurement.velocity_error
+        error = bound.new_tensor(2 * noise.position)
+        if measurement.position_error is not None:
+            error = error + measurement.position_error
+        return left_out_inactive(self.barriers, measurement, bound, error)
 
     def _instead(self) -> FeasibleSet:
         """What takes the place of an empty set."""

@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchfsid.compiled import array, use_kernel
 from torchfsid.halfspaces import ROUND_OFF
 
 PRIOR = -1
@@ -142,7 +143,13 @@ class Polygon:
         centre = self.vertices.detach().mean(1)
         offsets = offsets - (normals @ centre.unsqueeze(-1)).squeeze(-1)
         offsets = torch.where(self.valid, offsets, torch.inf)
-        basis = _inscribed_basis(normals.detach(), offsets.detach(), self.count)
+        if use_kernel(None, normals.detach()):  # a search without gradients
+            from torchfsid import polygon_kernel
+
+            found = polygon_kernel.inscribed_basis(array(normals), array(offsets), array(self.count), ROUND_OFF)
+            basis = torch.from_numpy(found)
+        else:
+            basis = _inscribed_basis(normals.detach(), offsets.detach(), self.count)
         inverse = _inverse_with_ones(take(normals, basis))
         solution = (inverse @ offsets.gather(1, basis).unsqueeze(-1)).squeeze(-1)
         return centre + solution[:, :2], solution[:, 2]

@@ -158,9 +158,9 @@ def read(
 ):  # fmt: skip
     """What a measurement of B robots says about theta, and their KKT conditions.
 
-    `bound` (B or 1, m or 1) is the slack of an active row, `ball` (B or 1,) bounds the error of C theta + d - u. `angles`
-    (B, m), errors of the rows' directions, turn each row by the fractions `spread`; (B, 0): there are none. `around`
-    is the fan of a full turn, `paper` asks for the critical region.
+    `bound` (B or 1, m or 1) is the slack of an active row, `ball` (B or 1,) bounds the error of C theta + d - u.
+    `angles` (B, m), errors of the rows' directions, turn each row by the fractions `spread`; (B, 0): there are none.
+    `around` is the fan of a full turn, `paper` asks for the critical region.
 
     Returns half-spaces (A, b, source), padded; (informative, alarmed, slack, excess), as in `reading.Reading`; (G,
     f, projector, free, offset, active, n_active, rank, case), as in `kkt.KktSolution`; and whether all rows, C and d
