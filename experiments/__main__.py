@@ -62,7 +62,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"experiments: {error.filename}: {error.strerror}", file=sys.stderr)
         return USAGE_ERROR
     except KeyboardInterrupt:
-        print("experiments: interrupted", file=sys.stderr)
+        again = "; the same command goes on from here" if chosen.command == "sweep" else ""
+        print(f"experiments: interrupted{again}", file=sys.stderr)
         return INTERRUPTED
     return 0
 

@@ -41,13 +41,14 @@ def sweep(config: SweepConfig, out: Path, *, jobs: int = 1, dask: str | None = N
     Raises:
         ConfigError: the folder holds another sweep, or another process is at work there, or there is no such cluster.
     """
-    out.mkdir(parents=True, exist_ok=True)
-    with Journal(out / "records.jsonl") as journal:
+    with _workers(jobs, dask) as workers, _journal(out) as journal:
         _claim(out / "config.yaml", dump(config))
         missing = [run for run in range(config.runs) if run not in journal.records]
         try:
-            for record in track(_records(config, missing, jobs, dask), config.runs, config.runs - len(missing)):
-                journal.append(record)
+            for done in track(
+                workers(joblib.delayed(record)(config, run) for run in missing), config.runs, config.runs - len(missing)
+            ):
+                journal.append(done)
         finally:
             write_tables(out, config, [journal.records[run] for run in sorted(journal.records)])
 
@@ -61,18 +62,16 @@ def _claim(path: Path, content: str) -> None:
         raise ConfigError(f"{path.parent}: holds another sweep; choose another --out, or remove it")
 
 
-def _records(config: SweepConfig, runs: list[int], jobs: int, dask: str | None) -> Iterator[dict[str, Any]]:
-    """One record per run, as they finish."""
-    with _backend(dask):
-        # joblib's annotation of batch_size says str; with "auto" runs would be lost in bunches.
-        parallel: Any = joblib.Parallel(n_jobs=jobs, batch_size=1, return_as="generator_unordered")  # type: ignore[arg-type]
-        yield from parallel(joblib.delayed(record)(config, run) for run in runs)
+def _journal(out: Path) -> Journal:
+    out.mkdir(parents=True, exist_ok=True)
+    return Journal(out / "records.jsonl")
 
 
 @contextmanager
-def _backend(dask: str | None) -> Iterator[None]:
+def _workers(jobs: int, dask: str | None) -> Iterator[Any]:
+    """Call it with tasks: results come as they finish."""
     if dask is None:
-        yield
+        yield _parallel(jobs)
         return
     try:
         from distributed import Client
@@ -83,7 +82,12 @@ def _backend(dask: str | None) -> Iterator[None]:
     except (OSError, ValueError) as error:
         raise ConfigError(f"--dask {dask}: {one_line(error)}") from error
     with client, joblib.parallel_config(backend="dask", client=client):
-        yield
+        yield _parallel(jobs)
+
+
+def _parallel(jobs: int) -> Any:
+    # In larger batches, finished runs would wait for others and be lost with them. (joblib annotates it as a text.)
+    return joblib.Parallel(n_jobs=jobs, batch_size=1, return_as="generator_unordered")  # type: ignore[arg-type]
 
 
 def record(config: SweepConfig, run: int) -> dict[str, Any]:

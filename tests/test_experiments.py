@@ -72,9 +72,9 @@ def five_cases(run_experiment: Runner) -> Results:
 # Configurations -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
-def test_configs_load_and_survive_being_written(path: Path, tmp_path: Path):
-    config = load_experiment(path)
+@pytest.mark.parametrize("name", ["two_pairs", "mixed_active", "four_robots", "five_cases"])
+def test_configs_load_and_survive_being_written(name: str, tmp_path: Path):
+    config = load_experiment(CONFIGS / f"{name}.yaml")
     (tmp_path / "config.yaml").write_text(dump(config), encoding="utf-8")
     assert load_experiment(tmp_path / "config.yaml") == config
     assert config.set == "critical_region"

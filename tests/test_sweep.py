@@ -1,0 +1,235 @@
+"""Sweeps: the same tables however they were run and interrupted, what they are made of, and what they refuse."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jaxtyping
+import pytest
+from distributed import LocalCluster
+
+from experiments.__main__ import main
+from experiments.journal import Journal
+from experiments.sweep import sweep
+from experiments.sweep_config import load_sweep
+from experiments.sweep_summary import summarise_sweep
+from experiments.sweep_tables import read_table
+from torchfsid.errors import ConfigError
+
+ROOT = Path(__file__).parents[1]
+TABLES = ("runs.csv", "runs.parquet", "series.csv", "series.parquet", "config.yaml")
+RUNS = 16
+
+CONFIG = """
+kind: sweep
+title: Tiny
+seed: 5
+repeats: 8
+times: [0, 0.2, 0.3]
+experiment:
+  kind: scene
+  task: {kind: goal, gain: 1}
+  barriers: [{kind: avoidance, safety_distance: 0.4, class_k: {gain: 2}}]
+  team: {robots: [2, 3], obstacles: [0, 1], place: [disc, circle], radius: 1.5, separation: 0.6}
+  measurement_noise: {shape: adversarial}
+  dt: 0.1
+  duration: 0.3
+  prior: {lower: [-4, -4], upper: [4, 4]}
+  set: inverse_optimal
+  noise: {velocity: 0}
+draw: {task.gain: [0.6, 1.6]}
+grid:
+  measurement_noise.velocity, noise.velocity: [[1.0e-3, 1.1e-3], [1.0e-2, 1.1e-2]]
+"""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _shapes_are_checked_elsewhere() -> Iterator[None]:
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("config") / "tiny.yaml"
+    path.write_text(CONFIG, encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(config: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("uninterrupted")
+    sweep(load_sweep(config), out, track=untracked)
+    return out
+
+
+def untracked(records: Iterable[Any], total: int, finished: int) -> Iterable[Any]:
+    return records
+
+
+def assert_same_tables(out: Path, other: Path) -> None:
+    for name in TABLES:
+        assert (out / name).read_bytes() == (other / name).read_bytes(), name
+
+
+# However it is run --------------------------------------------------------------------------------------------------
+
+
+def start(config: Path, out: Path, jobs: int) -> subprocess.Popen:
+    command = [sys.executable, "-m", "experiments", "sweep", str(config), "--out", str(out), "--jobs", str(jobs)]
+    return subprocess.Popen(command, cwd=ROOT, start_new_session=True, stderr=subprocess.DEVNULL)
+
+
+def finished(out: Path) -> int:
+    path = out / "records.jsonl"
+    return path.read_bytes().count(b"\n") if path.exists() else 0
+
+
+def kill_after(process: subprocess.Popen, out: Path, runs: int) -> None:
+    while finished(out) < runs and process.poll() is None:
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+
+
+def test_killed_twice_and_resumed_is_the_uninterrupted_sweep(config: Path, uninterrupted: Path, tmp_path: Path):
+    kill_after(start(config, tmp_path, jobs=1), tmp_path, runs=2)
+    first = (tmp_path / "records.jsonl").read_bytes().splitlines()[:2]
+    kill_after(start(config, tmp_path, jobs=2), tmp_path, runs=finished(tmp_path) + 2)
+    assert 4 <= finished(tmp_path) < RUNS
+    with (tmp_path / "records.jsonl").open("ab") as journal:
+        journal.write(b'{"run": 15, "error": "", "row": {"rob')  # a line that a kill has cut
+    sweep(load_sweep(config), tmp_path, track=untracked)
+    records = (tmp_path / "records.jsonl").read_bytes().splitlines()
+    assert records[:2] == first
+    assert sorted(json.loads(line)["run"] for line in records) == list(range(RUNS))
+    assert_same_tables(tmp_path, uninterrupted)
+
+
+def test_a_dask_cluster_gives_the_same(config: Path, uninterrupted: Path, tmp_path: Path):
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        sweep(load_sweep(config), tmp_path, dask=cluster.scheduler_address, track=untracked)
+    assert_same_tables(tmp_path, uninterrupted)
+
+
+def test_nothing_is_run_again_and_figures_are_drawn_from_the_tables(
+    config: Path, uninterrupted: Path, capsys: pytest.CaptureFixture[str]
+):
+    before = {path.name: path.read_bytes() for path in uninterrupted.iterdir()}
+    assert main(["sweep", str(config), "--out", str(uninterrupted)]) == 0
+    assert "50" not in capsys.readouterr().out.split("velocity")[0]
+    after = {path.name: path.read_bytes() for path in uninterrupted.iterdir()}
+    assert after.items() >= before.items()
+    assert after.keys() - before.keys() == {"summary.json", "figure.png", "figure.pdf"}
+    (uninterrupted / "figure.png").unlink()
+    assert main(["figures", str(uninterrupted)]) == 0
+    assert {path.name: path.read_bytes() for path in uninterrupted.iterdir()} == after
+
+
+def test_other_configs_and_other_processes_are_kept_out(
+    config: Path, uninterrupted: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert main(["sweep", str(config), "--out", str(uninterrupted), "--set", "seed=6"]) == 2
+    assert "holds another sweep" in capsys.readouterr().err
+    with Journal(uninterrupted / "records.jsonl"):
+        assert main(["sweep", str(config), "--out", str(uninterrupted)]) == 2
+    assert "another sweep is writing" in capsys.readouterr().err
+    assert main(["sweep", str(config), "--out", str(uninterrupted / "new"), "--dask", "nonsense://"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (uninterrupted / "new").exists()
+
+
+def test_the_journal_keeps_every_whole_line(tmp_path: Path):
+    path = tmp_path / "records.jsonl"
+    with Journal(path) as journal:
+        journal.append({"run": 3, "row": {"a": 1}})
+        journal.append({"run": 1, "row": {"a": 2}})
+    whole = path.read_bytes()
+    for broken in (b"", b"{", b'{"run": 2, "row": {}}', b"\0\0\0"):
+        path.write_bytes(whole + broken)
+        with Journal(path) as journal:
+            assert journal.records.keys() == {1, 3}
+            assert path.read_bytes() == whole
+    path.write_bytes(b"\0\0\n" + whole)
+    with Journal(path) as journal:
+        journal.append({"run": 0, "row": {}})
+    with Journal(path) as journal:
+        assert journal.records.keys() == {0, 1, 3}
+
+
+# What it is made of -------------------------------------------------------------------------------------------------
+
+
+def test_rows_say_what_was_run(config: Path, uninterrupted: Path):
+    tiny = load_sweep(config)
+    runs, series = (read_table(uninterrupted / f"{name}.parquet") for name in ("runs", "series"))
+    assert runs["run"].tolist() == list(range(RUNS))
+    for run in range(RUNS):
+        scene = tiny.scene(run)
+        assert scene.noise.velocity == runs["noise.velocity"][run] == tiny.point(run)["noise.velocity"]
+        assert scene.task.gain == runs["task.gain"][run]
+        assert len(scene.robots) == runs["robots"][run]
+        assert set(series["t"][series["run"] == run].tolist()) == set(tiny.times)
+    assert len({scene.seed for scene in map(tiny.scene, range(RUNS))}) == RUNS
+    assert (series["inverse_optimal_lost"] == 0).all()
+    shares = sum(runs[f"case_{letter}"] for letter in "ABCDE")
+    assert abs(shares - 1).max() < 1e-5
+
+
+def test_a_failed_run_is_a_row_and_not_the_end(config: Path, tmp_path: Path):
+    crowded = "experiment.team={robots: [1, 6], place: [disc], radius: 0.6, separation: 0.6}"
+    sweep(load_sweep(config, [crowded, "seed=8"]), tmp_path, track=untracked)
+    runs = read_table(tmp_path / "runs.parquet")
+    failed = runs["error"] != ""
+    assert 0 < failed.sum() < RUNS
+    assert all("no room" in error for error in runs["error"][failed])
+    assert summarise_sweep(tmp_path)["failed"] == failed.sum()
+
+
+# What it refuses ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("override", "named"),
+    [
+        ("kind=scene", "kind"),
+        ("repeats=0", "repeats"),
+        ("times=[0.2, 0.1]", "times"),
+        ("times=[0.2, 0.9]", "times"),
+        ("grid={nois.velocity: [1]}", "nois"),
+        ("grid={noise.velocity: []}", "grid.noise.velocity"),
+        ("grid={noise.velocity: [0.1, -0.1]}", "noise.velocity"),
+        ('grid={"noise.velocity, noise.slack": [[0.1]]}', "grid.noise.velocity, noise.slack[0]"),
+        ("grid={task.gain: [1, 2]}", "grid, draw"),
+        ("draw={task.gain: [2, 1]}", "draw.task.gain"),
+        ("experiment.seed=1", "experiment.seed"),
+        ("experiment.robots=[]", "experiment.robots"),
+        ("experiment.team.robots=[3, 2]", "team.robots"),
+        ("experiment.team.separation=9", "team"),
+        ("experiment.prior.upper=[4]", "prior"),
+        ("repeats=1000000", "repeats, grid"),
+    ],
+)
+def test_wrong_config_is_one_line_and_exit_code_2(
+    override: str, named: str, config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert main(["sweep", str(config), "--out", str(tmp_path / "out"), "--set", override]) == 2
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert f": {named}: " in message
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_committed_sweep_is_one():
+    assert load_sweep(ROOT / "configs" / "monte_carlo.yaml").runs == 1000
+    with pytest.raises(ConfigError, match="kind"):
+        load_sweep(ROOT / "configs" / "two_pairs.yaml")
