@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from torchfsid.inverse_optimal import NoiseBound as NoiseBound
     from torchfsid.inverse_optimal import inverse_optimal_set as inverse_optimal_set
     from torchfsid.kkt import solve_kkt as solve_kkt
+    from torchfsid.layers import ChebyshevCentre as ChebyshevCentre
+    from torchfsid.layers import ProjectOnto as ProjectOnto
     from torchfsid.measurement import Measurement as Measurement
     from torchfsid.neighbours import nearest_bodies as nearest_bodies
     from torchfsid.observer import SetMembershipObserver as SetMembershipObserver
@@ -51,6 +53,7 @@ _HOME = {
     "hybrid": ["HybridObserver"],
     "inverse_optimal": ["NoiseBound", "inverse_optimal_set"],
     "kkt": ["solve_kkt"],
+    "layers": ["ChebyshevCentre", "ProjectOnto"],
     "measurement": ["Measurement"],
     "neighbours": ["nearest_bodies"],
     "observer": ["SetMembershipObserver"],

@@ -1,0 +1,111 @@
+r"""The two programmes of `programmes`, solved on numpy arrays (B, ...), with what their derivatives need. No gradients.
+
+Rows are normalised, the point becomes the origin and the metric the identity; `active_rows` then finds the active rows.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+
+from torchfsid import active_rows
+from torchfsid.active_rows import Mask, Reals, inscribed_rows, nearest_rows, times
+from torchfsid.halfspaces import ROUND_OFF
+
+
+class Status(IntEnum):
+    """What became of one item of a batch; where there is no answer, its value is NaN and its gradient zero."""
+
+    OK = 0
+    EMPTY = 1
+    """No point satisfies the rows. The inscribed ball has a negative radius then: minus the depth, the least distance
+    by which all rows have to be moved outward (-inf: a row 0.z <= b with b < 0)."""
+    UNBOUNDED = 2
+    """Of the inscribed ball: there is no largest one (radius inf), or its centre can roll away to infinity."""
+    DEGENERATE = 3
+    """Of the inscribed ball: its radius is zero within round-off, the set has no interior."""
+    UNDEFINED = 4
+    """A row or the point is NaN or infinite, or the metric is not positive definite."""
+
+
+def nearest_point(A: Reals, b: Reals, y: Reals, metric: Reals | None = None) -> tuple:
+    """Point, multipliers, active rows, the places they fill, status."""
+    finite = np.isfinite(A.reshape(len(A), -1).sum(-1) + b.sum(-1) + y.sum(-1))
+    rows = A
+    if metric is not None:
+        root, definite = _roots(metric)
+        finite &= definite
+        rows = _whitened(A, root)
+    unit, offsets, impossible = _unit(rows, b - times(A, y), finite)
+    found = nearest_rows(unit, offsets)
+    ok = finite & ~found.empty & ~impossible
+    filled = ok[:, None] & (np.arange(A.shape[-1]) < found.count[:, None])
+    z = found.point if metric is None else np.linalg.solve(root.swapaxes(-1, -2), found.point[..., None])[..., 0]
+    # Once more, as a correction: this removes the round-off of a distant y, and gives the given rows' own multipliers.
+    z, pull = np.where(ok[:, None], y + z, 0.0), np.where(ok[:, None], -z, 0.0)
+    pull = pull if metric is None else times(metric, pull)
+    at = np.arange(len(A))[:, None]
+    N = np.where(filled[..., None], A[at, found.rows], 0.0)
+    correction, mu = solve_active(N, filled, pull, np.where(filled, b[at, found.rows], 0.0) - times(N, z), metric)
+    status = np.where(finite, np.where(ok, Status.OK, Status.EMPTY), Status.UNDEFINED)
+    return np.where(ok[:, None], z + correction, np.nan), mu, found.rows, filled, status
+
+
+def solve_active(N: Reals, filled: Mask, pull: Reals, offsets: Reals, metric: Reals | None = None) -> tuple:
+    """z and mu with H z + N' mu = pull, N z = offsets, for the first rows of N, `filled`."""
+    if metric is None:
+        return active_rows.solve_active(N, filled, pull, offsets)
+    root, _ = _roots(metric)
+    pull = np.linalg.solve(root, pull[..., None])[..., 0]
+    z, mu = active_rows.solve_active(_whitened(N, root), filled, pull, offsets)
+    return np.linalg.solve(root.swapaxes(-1, -2), z[..., None])[..., 0], mu
+
+
+def inscribed_ball(A: Reals, b: Reals) -> tuple:
+    """Centre, radius, the rows that decide them (m and above: at infinity), status."""
+    finite = np.isfinite(A.reshape(len(A), -1).sum(-1) + b.sum(-1))
+    m, p = A.shape[1:]
+    unit, offsets, impossible = _unit(A, b, finite)
+    found = inscribed_rows(unit, offsets)
+    ball, radius = found.ball, found.ball[:, p]
+    size = np.abs(offsets[np.arange(len(A))[:, None], found.rows.clip(max=m - 1)]).max(-1) + np.abs(ball).sum(-1)
+    thin = np.abs(radius) <= ROUND_OFF * size
+    undecided = ~finite | impossible | found.open_radius
+    status = np.where(thin, Status.DEGENERATE, np.where(radius < 0, Status.EMPTY, Status.OK))
+    status[found.open_centre & (status == Status.OK)] = Status.UNBOUNDED
+    ball[:, :p][found.open_centre | undecided] = np.nan
+    for mask, value, what in (
+        (found.open_radius, np.inf, Status.UNBOUNDED),
+        (impossible, -np.inf, Status.EMPTY),
+        (~finite, np.nan, Status.UNDEFINED),
+    ):
+        radius[mask], status[mask] = value, what
+    return ball[:, :p], radius, np.where(undecided[:, None], m + np.arange(p + 1), found.rows), status
+
+
+def _roots(metric: Reals) -> tuple[Reals, Mask]:
+    """Cholesky factors, the identity where a matrix is not positive definite; is it?"""
+    p = metric.shape[-1]
+    root, definite = np.zeros_like(metric), np.ones(len(metric), dtype=bool)
+    for j in range(p):
+        column = metric[:, j:, j] - (root[:, j:, :j] @ root[:, j, :j, None])[..., 0]
+        definite &= column[:, 0] > 0
+        root[:, j:, j] = column / np.sqrt(np.where(definite, column[:, 0], 1.0))[:, None]
+    definite &= np.isfinite(root).all((-1, -2))
+    return np.where(definite[:, None, None], root, np.eye(p)), definite
+
+
+def _whitened(rows: Reals, root: Reals) -> Reals:
+    """Rows as functions of root' z."""
+    return np.linalg.solve(root, rows.swapaxes(-1, -2)).swapaxes(-1, -2)
+
+
+def _unit(A: Reals, b: Reals, finite: Mask) -> tuple[Reals, Reals, Mask]:
+    """Unit rows and their offsets (zero rows for items that are not finite); does some row 0.z <= b have b < 0?"""
+    if not finite.all():
+        A, b = np.where(finite[:, None, None], A, 0.0), np.where(finite[:, None], b, 1.0)
+    norms = np.sqrt(np.einsum("bmp,bmp->bm", A, A))
+    is_row = norms > 0
+    norms = np.where(is_row, norms, 1.0)
+    return A / norms[..., None], b / norms, (~is_row & (b < 0)).any(-1)
