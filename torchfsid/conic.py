@@ -29,7 +29,7 @@ from torchfsid.programmes import InscribedBall, NearestPoint, broadcast, times
 FAR = 1e2
 """Units of length beyond which a row is left out."""
 
-SOLVE = {"solve_method": "SCS", "eps": 1e-11, "max_iters": 100_000, "acceleration_lookback": 0}
+SOLVE: dict[str, Any] = {"solve_method": "SCS", "eps": 1e-11, "max_iters": 100_000}
 """SCS's options. Its default tolerance is no use for gradients."""
 
 DIFFERENTIATE = {"mode": "dense"}
