@@ -137,18 +137,21 @@ class Polygon:
         gradients. Where the centre is not unique (two parallel edges touch the disc) the end of the segment of centres
         that the third row decides is returned; the radius and its gradient are right in any case.
         """
+        basis = None
+        if use_kernel(None, self.vertices.detach()):
+            from torchfsid import polygon_kernel
+
+            rows = map(array, (self.vertices, self.A, self.b, self.count))
+            basis, centre, radius = map(torch.from_numpy, polygon_kernel.inscribed(*rows, ROUND_OFF))
+            if use_kernel(None, self.vertices, self.A, self.b):
+                return centre, radius
         norms = torch.where(self.valid, self.A.square().sum(-1), 1.0).sqrt()
         normals, offsets = self.A / norms.unsqueeze(-1), self.b / norms
         # About a point of the set, so that thin sets far from the origin lose no digits.
         centre = self.vertices.detach().mean(1)
         offsets = offsets - (normals @ centre.unsqueeze(-1)).squeeze(-1)
         offsets = torch.where(self.valid, offsets, torch.inf)
-        if use_kernel(None, normals.detach()):  # a search without gradients
-            from torchfsid import polygon_kernel
-
-            found = polygon_kernel.inscribed_basis(array(normals), array(offsets), array(self.count), ROUND_OFF)
-            basis = torch.from_numpy(found)
-        else:
+        if basis is None:
             basis = _inscribed_basis(normals.detach(), offsets.detach(), self.count)
         inverse = _inverse_with_ones(take(normals, basis))
         solution = (inverse @ offsets.gather(1, basis).unsqueeze(-1)).squeeze(-1)

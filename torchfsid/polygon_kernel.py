@@ -284,19 +284,25 @@ def clip(polygons, A, b, stamp, source, most, epsilon, parallel):
 
 @compiled
 @no_type_check
-def inscribed_basis(normals, offsets, count, epsilon):
-    """The three rows that touch a largest inscribed disc, `polygon._inscribed_basis` one polygon after the other."""
-    B = len(count)
-    basis, inverse, solution = np.empty((B, 3), np.int64), np.empty((3, 3)), np.empty(3)
+def inscribed(vertices, A, b, count, epsilon):
+    """A largest inscribed disc of each polygon, as in `Polygon.chebyshev`: its rows, centre and radius."""
+    B, V = b.shape
+    basis, centre, radius = np.empty((B, 3), np.int64), np.zeros((B, 2)), np.empty(B)
+    row, right, inverse, solution = np.empty((V, 2)), np.empty(V), np.empty((3, 3)), np.empty(3)
     for k in range(B):
-        n, row, right = count[k], normals[k], offsets[k]
-        half, scale = 1, 0.0
+        n, half, scale = count[k], 1, 0.0
         for i in range(n):
+            centre[k, 0] += vertices[k, i, 0] / n
+            centre[k, 1] += vertices[k, i, 1] / n
+        for i in range(n):
+            norm = math.sqrt(A[k, i, 0] ** 2 + A[k, i, 1] ** 2)
+            row[i, 0], row[i, 1] = A[k, i, 0] / norm, A[k, i, 1] / norm
+            right[i] = b[k, i] / norm - (row[i, 0] * centre[k, 0] + row[i, 1] * centre[k, 1])
             scale = max(scale, abs(right[i]))
         while half < n - 2 and row[0, 0] * row[half + 1, 1] - row[0, 1] * row[half + 1, 0] >= 0:
             half += 1
         basis[k, 0], basis[k, 1], basis[k, 2] = 0, half, half + 1
-        for _ in range(3 * len(right)):
+        for _ in range(3 * V):
             _inverse_with_ones(row, basis[k], inverse)
             for i in range(3):
                 solution[i] = 0.0
@@ -315,7 +321,10 @@ def inscribed_basis(normals, offsets, count, epsilon):
                 if share > epsilon and max(inverse[2, j], 0.0) / share < least:
                     least, leaving = max(inverse[2, j], 0.0) / share, j
             basis[k, leaving] = entering
-    return basis
+        centre[k, 0] += solution[0]
+        centre[k, 1] += solution[1]
+        radius[k] = solution[2]
+    return basis, centre, radius
 
 
 @compiled

@@ -1,0 +1,118 @@
+"""python -m benchmarks fleet [--steps 40] [--long 10000]
+
+The whole observer update (rows from positions, active set, KKT conditions, half-spaces, clipping) for fleets of 1 to
+100 000 robots with 8 neighbours each (`scenario`), from the prior on: robot-updates per second of CPU time on one
+thread. The search of the neighbours, which the observer does not do, is given beside it. Then one robot, update by
+update, and a fleet over many steps, whose cost must not grow.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import resource
+import time
+
+import numpy as np
+import torch
+
+from benchmarks import save
+from benchmarks.scenario import NEIGHBOURS, Fleet, measured, observer
+from torchfsid.compiled import installed
+
+SIZES = (1_000, 10_000, 100_000)
+
+
+def run(robots: int, steps: int, noisy: bool, compiled: bool) -> dict:
+    """A fleet from the prior on; times per robot and update [us]."""
+    fleet, spent, search, cut, used, active = Fleet(robots, noisy), [], 0.0, 0, 0, 0
+    watching = observer(fleet.prior(), compiled)
+    for t, x, u in itertools.islice(fleet, steps):
+        began = time.process_time()
+        measurement = measured(t, x, u)
+        ready = time.process_time()
+        estimate = watching.update(measurement)
+        spent.append(time.process_time() - ready)
+        search += ready - began
+        cut += int((estimate.feasible_set.last_cut == t).sum())
+        used += int(estimate.informative.sum())
+        active += int((estimate.kkt.n_active > 0).sum())
+    body, count = watching.feasible_set.body, robots * steps
+    lost = int((~watching.feasible_set.contains(fleet.goals)).sum())
+    return {
+        "robots": robots,
+        "steps": steps,
+        "noisy": noisy,
+        "per_second": count / sum(spent),
+        "microseconds": 1e6 * sum(spent) / count,
+        "last_microseconds": 1e6 * float(np.median(spent[-steps // 4 :])) / robots,
+        "search_microseconds": 1e6 * search / count,
+        "share_cut": cut / count,
+        "share_used": used / count,
+        "share_active": active / count,
+        "truths_lost": lost,
+        "set_bytes_per_robot": sum(field.nbytes for field in body.fields()) / robots,
+        "facets": float(body.count.double().mean()),
+    }
+
+
+def run_alone(steps: int, compiled: bool) -> dict:
+    """One robot among nine, update by update [us]: wall-clock time, which is what its user waits for."""
+    fleet, spent = Fleet(NEIGHBOURS + 1), []
+    watching = observer(fleet.prior().select(torch.tensor([0])), compiled)
+    for t, x, u in itertools.islice(fleet, steps):
+        measurement, began = measured(t, x, u, range(1)), time.perf_counter()
+        watching.update(measurement)
+        spent.append(1e6 * (time.perf_counter() - began))
+    return {"steps": steps, **dict(zip(("median", "p90"), np.quantile(spent[5:], (0.5, 0.9)).tolist(), strict=True))}
+
+
+def run_long(robots: int, steps: int, compiled: bool) -> dict:
+    """Cost per robot and update [us] and slots of the sets along a long run, in ten pieces."""
+    fleet, spent, slots = Fleet(robots, noisy=True), [], []
+    watching = observer(fleet.prior(), compiled)
+    for t, x, u in itertools.islice(fleet, steps):
+        measurement, began = measured(t, x, u), time.process_time()
+        watching.update(measurement)
+        spent.append(time.process_time() - began)
+        slots.append(watching.feasible_set.body.slots)
+    pieces = np.array_split(np.array(spent), 10)
+    return {
+        "robots": robots,
+        "steps": steps,
+        "microseconds": [1e6 * float(np.median(piece)) / robots for piece in pieces],
+        "slots": [int(piece[-1]) for piece in np.array_split(np.array(slots), 10)],
+        "truths_lost": int((~watching.feasible_set.contains(fleet.goals)).sum()),
+    }
+
+
+def main(arguments: list[str]) -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks fleet")
+    parser.add_argument("--steps", type=int, default=40)
+    parser.add_argument("--long", type=int, default=10_000)
+    parser.add_argument("--largest", type=int, default=SIZES[-1])
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    ways = {"torch": False} | ({"compiled": True} if installed() else {})
+    results: dict = {"neighbours": NEIGHBOURS}
+    for way, compiled in ways.items():
+        run(3, 2, True, compiled)  # compile, and load what loads late
+        fleets = [(robots, noisy) for noisy in (False, True) for robots in SIZES if robots <= options.largest]
+        rows = [run(robots, options.steps, noisy, compiled) for robots, noisy in fleets]
+        alone, long = run_alone(2000, compiled), run_long(200, options.long, compiled)
+        results[way] = {"fleets": rows, "alone": alone, "long": long}
+        print(f"\n{way}")
+        for row in rows:
+            print(
+                f"  B = {row['robots']:7d}, {'noisy' if row['noisy'] else 'exact'}: {row['per_second']:9.0f} updates/s, "
+                f"{row['microseconds']:.2f} us each (last quarter {row['last_microseconds']:.2f}); "
+                f"cut {row['share_cut']:.0%}, active {row['share_active']:.0%}, used {row['share_used']:.1%}, "
+                f"truths lost {row['truths_lost']}; {row['set_bytes_per_robot']:.0f} bytes; "
+                f"neighbours {row['search_microseconds']:.2f} us"
+            )
+        print(f"  B = 1: median {alone['median']:.0f} us, 90 % below {alone['p90']:.0f} us")
+        along, slots = ", ".join(f"{cost:.2f}" for cost in long["microseconds"]), long["slots"]
+        print(f"  {long['steps']} steps of {long['robots']} robots: {along} us; slots {slots[0]}..{slots[-1]}")
+    results["peak_memory_MiB"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"\npeak memory {results['peak_memory_MiB']:.0f} MiB")
+    print(f"saved: {save('fleet', results, ['torch', 'numpy', 'scipy', *(['numba'] if installed() else [])])}")

@@ -1,0 +1,86 @@
+"""The fleet that `fleet` and `observer` watch: robots on a square, 4 m^2 each, going to goals past each other.
+
+Each robot avoids its 8 nearest bodies by the paper's rows (gain 1.5, Ds 0.4 m) and its control solves its QP exactly.
+The declared bound is 5 mm/s. `noisy` controls are measured with an error anywhere in a disc of this radius, which goes
+on cutting the sets at most steps; others exactly, as a simulator logs them, which cuts them at the first ones. Every 40
+steps of 0.05 s all robots are put to new places while their goals stay, so that a run can go on for as long as one
+likes. Everything is seeded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchfsid.barriers import ClassK, CollisionAvoidance
+from torchfsid.feasible_set import FeasibleSet
+from torchfsid.inverse_optimal import NoiseBound
+from torchfsid.measurement import Measurement
+from torchfsid.neighbours import nearest_bodies
+from torchfsid.observer import SetMembershipObserver
+from torchfsid.tasks import GoalTask
+
+NEIGHBOURS, STEP, EPISODE, ERROR = 8, 0.05, 40, 5e-3
+TASK, BARRIER = GoalTask(0.9), CollisionAvoidance(ClassK(1.5), safety_distance=0.4)
+
+
+def solve_qp(A: Tensor, b: Tensor, nominal: Tensor) -> Tensor:
+    """argmin |u - nominal|^2 s.t. A u <= b: the best of the feasible projections onto no row, one row, two rows; zero,
+    as controllers do, where there is none."""
+    m = b.shape[1]
+    i, j = torch.triu_indices(m, m, 1)
+    beyond = (A @ nominal.unsqueeze(-1)).squeeze(-1) - b
+    one = nominal.unsqueeze(1) - A * (beyond / A.square().sum(-1)).unsqueeze(-1)
+    (p, q), (r, s) = A[:, i].unbind(-1), A[:, j].unbind(-1)
+    two = torch.stack([b[:, i] * s - b[:, j] * q, p * b[:, j] - r * b[:, i]], dim=-1) / (p * s - q * r).unsqueeze(-1)
+    candidates = torch.cat([nominal.unsqueeze(1), one, two.nan_to_num(torch.inf)], dim=1)
+    feasible = (candidates @ A.mT <= b.unsqueeze(1) + 1e-9).all(-1)
+    apart = torch.where(feasible, (candidates - nominal.unsqueeze(1)).square().sum(-1), torch.inf)
+    best, which = apart.min(-1, keepdim=True)
+    u = candidates.gather(1, which.unsqueeze(-1).expand(-1, -1, 2)).squeeze(1)
+    return torch.where(best.isfinite(), u, 0.0)
+
+
+class Fleet:
+    """The robots. Iterating gives, without end, the positions and the measured controls."""
+
+    def __init__(self, robots: int, noisy: bool = False, seed: int = 0) -> None:
+        self.error = ERROR if noisy else 0.0
+        self.rng, self.half = np.random.default_rng(seed), float(np.sqrt(robots))
+        self.goals = self._places(robots)
+
+    def _places(self, robots: int) -> Tensor:
+        """One in each cell of a grid of 2 m, in random order: nobody starts closer than 0.5 m to another."""
+        side = int(np.ceil(np.sqrt(robots)))
+        cell = self.rng.permutation(side * side)[:robots]
+        corner = np.stack([cell % side, cell // side], axis=-1) * 2.0 - self.half
+        return torch.from_numpy(corner + self.rng.uniform(0.25, 1.75, (robots, 2)))
+
+    def __iter__(self) -> Iterator[tuple[float, Tensor, Tensor]]:
+        step, robots = 0, len(self.goals)
+        while True:
+            if step % EPISODE == 0:
+                x = self._places(robots)
+            rows = BARRIER(nearest_bodies(0.0, x, count=NEIGHBOURS))
+            u = solve_qp(
+                rows.A, rows.b.masked_fill((rows.A == 0).all(-1), torch.inf).nan_to_num(1e9), 0.9 * (self.goals - x)
+            )
+            angle, size = self.rng.uniform(0, 2 * np.pi, robots), self.error * np.sqrt(self.rng.uniform(0, 1, robots))
+            error = torch.from_numpy(size[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+            yield STEP * step, x, torch.where((u == 0).all(-1, keepdim=True), u, u + error)
+            x, step = x + STEP * u, step + 1
+
+    def prior(self) -> FeasibleSet:
+        corner = torch.full_like(self.goals, self.half + 1)
+        return FeasibleSet.from_box(-corner, corner)
+
+
+def observer(prior: FeasibleSet, compiled: bool) -> SetMembershipObserver:
+    return SetMembershipObserver(TASK, [BARRIER], prior, noise=NoiseBound(ERROR), compiled=compiled)
+
+
+def measured(t: float, x: Tensor, u: Tensor, robots: range | None = None) -> Measurement:
+    return nearest_bodies(t, x, u, count=NEIGHBOURS, robots=robots)
