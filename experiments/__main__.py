@@ -88,6 +88,7 @@ def _run(path: Path, out: Path, overrides: Sequence[str]) -> None:
     from rich.progress import track
 
     from experiments.run import run
+    from experiments.swarm import print_swarm
     from experiments.table import print_table
     from experiments.verdict import print_verdict
 
@@ -100,7 +101,7 @@ def _run(path: Path, out: Path, overrides: Sequence[str]) -> None:
     summary = run(config, out, observing)
     _draw(out)
     console = Console(width=max(Console().width, TABLE_WIDTH))
-    (print_table if config.kind == "cases" else print_verdict)(summary, console)
+    {"scene": print_verdict, "cases": print_table, "swarm": print_swarm}[config.kind](summary, console)
 
 
 def _sweep(path: Path, out: Path, overrides: Sequence[str], jobs: int, dask: str | None) -> None:

@@ -5,6 +5,7 @@ Each file is complete: nothing is inherited, and what is left out has the defaul
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -217,10 +218,61 @@ class CasesConfig(ExperimentConfig):
         return self
 
 
-MODELS: dict[object, type[SceneConfig] | type[CasesConfig]] = {"scene": SceneConfig, "cases": CasesConfig}
+class SwarmConfig(ExperimentConfig):
+    """Many robots in a square, each of which sees no more than its nearest neighbours. No filter runs along.
+
+    Attributes:
+        robots: how many. side: of the square [m]. separation: between their starts [m].
+        travel: goals lie in discs of this radius around the starts, within the square [m].
+        neighbours, sensing_radius: a robot avoids so many of its nearest neighbours within this distance [m].
+        seed: of everything random.
+    """
+
+    kind: Literal["swarm"]
+    robots: Annotated[int, Field(strict=True, ge=1)]
+    side: Positive
+    separation: NonNegative
+    travel: Positive
+    neighbours: Annotated[int, Field(strict=True, ge=1)]
+    sensing_radius: Positive
+    seed: WholeNumber
+    measurement_noise: MeasurementNoiseConfig = MeasurementNoiseConfig()
+    snapshots: Annotated[tuple[NonNegative, ...], Field(min_length=1, max_length=4)]
+
+    @property
+    def spacing(self) -> float:
+        """Of the grid that starts are moved away from [m]."""
+        return self.side / math.ceil(math.sqrt(self.robots))
+
+    @model_validator(mode="after")
+    def _is_a_swarm(self) -> SwarmConfig:
+        self._require_in_prior((-self.side / 2, -self.side / 2), "side")
+        self._require_in_prior((self.side / 2, self.side / 2), "side")
+        if self.separation > self.spacing:
+            raise wrong(f"no room for {self.robots} robots {self.separation} m apart", "side")
+        if self.measurement_noise.position > 0 or self.measurement_noise.shape != "uniform":
+            raise wrong("a swarm knows uniform errors of velocities only", "measurement_noise")
+        for i, barrier in enumerate(self.barriers):
+            if isinstance(barrier, AvoidanceConfig) and barrier.neighbour_velocity == "current":
+                raise wrong("no joint QP over a swarm: none or previous", f"barriers[{i}].neighbour_velocity")
+            if isinstance(barrier, AvoidanceConfig) and barrier.margin is not None:
+                raise wrong("bodies of a swarm have no radius: give safety_distance", f"barriers[{i}].margin")
+        require_increasing(self.snapshots, "snapshots")
+        if self.snapshots[-1] > self.duration:
+            raise wrong(f"must not be after the end, {self.duration} s, got {self.snapshots[-1]}", "snapshots")
+        return self
 
 
-def load_experiment(path: str | Path, overrides: Iterable[str] = ()) -> SceneConfig | CasesConfig:
+RunConfig = SceneConfig | CasesConfig | SwarmConfig
+
+MODELS: dict[object, type[SceneConfig] | type[CasesConfig] | type[SwarmConfig]] = {
+    "scene": SceneConfig,
+    "cases": CasesConfig,
+    "swarm": SwarmConfig,
+}
+
+
+def load_experiment(path: str | Path, overrides: Iterable[str] = ()) -> RunConfig:
     """The experiment in a file, after `overrides` such as "noise.velocity=0.02". Raises `ConfigError`."""
     mapping = apply_overrides(read_yaml(path), overrides)
     kind = str(mapping.get("kind"))

@@ -34,7 +34,7 @@ def measure(true: Trajectory, config: SceneConfig) -> Trajectory:
     if noise.shape == "adversarial":
         return _worst(true, config, random)
     of_all = (len(true.t), robots)
-    draw, shape = (_in_disc, of_all) if noise.shape == "uniform" else (_on_circle, (robots,))
+    draw, shape = (in_disc, of_all) if noise.shape == "uniform" else (_on_circle, (robots,))
     x, u = true.x.clone(), true.u.clone()
     x[:, :robots] += draw(random, noise.position, shape)
     u[:, :robots] += draw(random, noise.velocity, shape)
@@ -94,7 +94,7 @@ def _repeated(measurement: Measurement, times: int) -> Measurement:
     )
 
 
-def _in_disc(random: np.random.Generator, radius: float, shape: tuple[int, ...]) -> Float[Tensor, "*shape 2"]:
+def in_disc(random: np.random.Generator, radius: float, shape: tuple[int, ...]) -> Float[Tensor, "*shape 2"]:
     """Points uniformly distributed in a disc."""
     distance = radius * np.sqrt(random.uniform(size=shape))
     angle = random.uniform(0, 2 * np.pi, size=shape)

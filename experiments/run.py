@@ -20,11 +20,12 @@ import torch
 from torch import Tensor
 
 from experiments.cases import record_cases
-from experiments.config import CasesConfig, SceneConfig
+from experiments.config import CasesConfig, RunConfig, SwarmConfig
 from experiments.observers import Observers
 from experiments.recording import Recording, simulate_scene
 from experiments.saved import Results
 from experiments.summary import summarise_scene
+from experiments.swarm import run_swarm
 from experiments.table import measure_cases
 from torchfsid.barriers import stack_barriers
 from torchfsid.documents import dump
@@ -37,8 +38,10 @@ Track = Callable[[Iterable[Measurement], int], Iterable[Measurement]]
 """Passes measurements on and shows how far they have come; the number is how many there are."""
 
 
-def run(config: SceneConfig | CasesConfig, out: Path, track: Track) -> dict[str, Any]:
+def run(config: RunConfig, out: Path, track: Track) -> dict[str, Any]:
     """Simulate, observe, and write everything but the figures; returns the summary."""
+    if isinstance(config, SwarmConfig):
+        return run_swarm(config, out, track)
     if isinstance(config, CasesConfig):
         observers = Observers(config, record_cases(config))
         _observe(observers, out, track)

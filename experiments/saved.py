@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from experiments.config import CasesConfig, SceneConfig, load_experiment
+from experiments.config import CasesConfig, SceneConfig, SwarmConfig, load_experiment
 
 SETS: tuple[Literal["critical_region", "inverse_optimal"], ...] = ("critical_region", "inverse_optimal")
 
@@ -38,7 +38,9 @@ class Results:
 
     @cached_property
     def config(self) -> SceneConfig | CasesConfig:
-        return load_experiment(self.folder / "config.yaml")
+        config = load_experiment(self.folder / "config.yaml")
+        assert not isinstance(config, SwarmConfig)
+        return config
 
     @cached_property
     def robots(self) -> list[str]:

@@ -7,14 +7,15 @@ from pathlib import Path
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from experiments.config import CasesConfig
+from experiments.config import CasesConfig, SwarmConfig
 from experiments.figures.animation import animate
 from experiments.figures.cases import draw_cases
 from experiments.figures.single import draw_single
 from experiments.figures.style import STYLE
+from experiments.figures.swarm import draw_swarm
 from experiments.figures.team import draw_comparison, draw_team
 from experiments.saved import Results
-from torchfsid.documents import read_yaml
+from torchfsid.documents import load, read_yaml
 
 
 def draw(folder: Path) -> list[Path]:
@@ -29,6 +30,9 @@ def draw(folder: Path) -> list[Path]:
     with mpl.rc_context(STYLE):
         if kind == "sweep":
             return _draw_sweep(folder)
+        if kind == "swarm":
+            config = load(folder / "config.yaml", SwarmConfig)
+            return _save(draw_swarm(folder, config), folder, "figure")
         results = Results(folder)
         config = results.config
         if isinstance(config, CasesConfig):

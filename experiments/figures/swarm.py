@@ -1,0 +1,82 @@
+"""A swarm: where the robots are at some times, coloured by how large their sets still are; and how the sets shrink."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import EllipseCollection, LineCollection
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+
+from experiments.config import SwarmConfig
+from experiments.figures.style import INVERSE_OPTIMAL
+from torchfsid.config import AvoidanceConfig
+
+COLOURS = "viridis_r"
+
+SMALLEST = 1e-6
+"""Where the colours end [m]."""
+
+
+def draw_swarm(folder: Path, config: SwarmConfig) -> Figure:
+    sizes, robots = _columns(folder / "sizes.csv"), _columns(folder / "snapshots.csv")
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    times = np.unique(robots["t"])
+    figure = Figure(figsize=(3.1 * len(times) + 3.6, 3.9), layout="constrained")
+    panels = figure.subplots(1, len(times) + 1, width_ratios=[3.1] * len(times) + [2.9])
+    smallest = max(float(robots["sqrt_area"].min()), SMALLEST)
+    norm = LogNorm(smallest, float(robots["sqrt_area"].max()))
+    discs = None
+    for i, (axes, t) in enumerate(zip(panels, times, strict=False)):
+        at = robots["t"] == t
+        places, goals = (np.stack([robots[f"{p}x"][at], robots[f"{p}y"][at]], axis=-1) for p in ("", "goal_"))
+        axes.add_collection(LineCollection(list(np.stack([places, goals], axis=1)), colors="0.85", lw=0.4, zorder=0))
+        width = np.full(at.sum(), _safety_distance(config))
+        discs = EllipseCollection(
+            width, width, np.zeros(at.sum()), units="xy", offsets=places, offset_transform=axes.transData, cmap=COLOURS
+        )
+        discs.set(array=robots["sqrt_area"][at].clip(min=smallest), norm=norm, edgecolor="0.3", linewidth=0.2)
+        axes.add_collection(discs)
+        half = 0.52 * config.side
+        axes.set(xlim=(-half, half), ylim=(-half, half), aspect="equal", xlabel="x [m]")
+        axes.set_title(f"({chr(ord('a') + i)})  t = {t:.4g} s", fontweight="bold")
+    panels[0].set_ylabel("y [m]")
+    if discs is not None:
+        figure.colorbar(discs, ax=panels[:-1], label="√area of the goal's set [m]", shrink=0.8, pad=0.01)
+    _draw_sizes(panels[-1], sizes)
+    figure.suptitle(
+        f"{config.title}, {config.steps} steps: truth lost for {summary['truth_outside']}",
+        fontsize=9,
+        x=0.01,
+        ha="left",
+    )
+    return figure
+
+
+def _draw_sizes(axes: Axes, sizes: dict[str, np.ndarray]) -> None:
+    t = sizes["t"]
+    axes.fill_between(t, sizes["sqrt_area_0.1"], sizes["sqrt_area_0.9"], color=INVERSE_OPTIMAL, alpha=0.2, lw=0)
+    axes.semilogy(t, sizes["sqrt_area_0.5"], color=INVERSE_OPTIMAL, lw=1.8, label="median, 10 % to 90 %")
+    axes.semilogy(t, sizes["sqrt_area_1"], color=INVERSE_OPTIMAL, lw=1.0, ls=(0, (1, 1)), label="largest")
+    axes.set(xlabel="t [s]", ylabel="√area [m]", xlim=(t[0], t[-1]))
+    axes.set_title("sizes of the sets", fontweight="bold")
+    axes.grid(True)
+    axes.legend(loc="lower left")
+
+
+def _columns(path: Path) -> dict[str, np.ndarray]:
+    columns: dict[str, list[str]] = defaultdict(list)
+    with path.open(newline="", encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            for name, cell in row.items():
+                columns[name].append(cell)
+    return {name: np.array(cells, dtype=str if name == "case" else float) for name, cells in columns.items()}
+
+
+def _safety_distance(config: SwarmConfig) -> float:
+    return next(b.safety_distance for b in config.barriers if isinstance(b, AvoidanceConfig) and b.safety_distance)
