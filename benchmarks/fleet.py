@@ -104,7 +104,8 @@ def main(arguments: list[str]) -> None:
         print(f"\n{way}")
         for row in rows:
             print(
-                f"  B = {row['robots']:7d}, {'noisy' if row['noisy'] else 'exact'}: {row['per_second']:9.0f} updates/s, "
+                f"  B = {row['robots']:7d}, {'noisy' if row['noisy'] else 'exact'}: "
+                f"{row['per_second']:9.0f} updates/s, "
                 f"{row['microseconds']:.2f} us each (last quarter {row['last_microseconds']:.2f}); "
                 f"cut {row['share_cut']:.0%}, active {row['share_active']:.0%}, used {row['share_used']:.1%}, "
                 f"truths lost {row['truths_lost']}; {row['set_bytes_per_robot']:.0f} bytes; "

@@ -39,18 +39,18 @@ def _box(vertices, k, n):
 
 @ordered
 @no_type_check
-def _beyond(vertices, k, n, p, q, c):
+def _beyond(vertices, n, p, q, c):
     """How far the vertices reach beyond the line (p, q).z = c."""
     most = -np.inf
     for i in range(n):
-        beyond = p * vertices[k, i, 0] + q * vertices[k, i, 1] - c
+        beyond = p * vertices[i, 0] + q * vertices[i, 1] - c
         most = beyond if beyond > most else most
     return most
 
 
 @compiled
 @no_type_check
-def _any_cuts(vertices, k, n, reach, A, b, tolerance, cutting, epsilon):
+def _any_cuts(vertices, k, n, reach, A, b, tolerance, beyond, cutting, epsilon):
     """Mark the rows that some vertex exceeds by more than round-off; the bounding box spares many of them the loop."""
     x0, x1, y0, y1 = _box(vertices, k, n)
     found = False
@@ -59,14 +59,15 @@ def _any_cuts(vertices, k, n, reach, A, b, tolerance, cutting, epsilon):
         cutting[r] = False
         if p * (x1 if p > 0 else x0) + q * (y1 if q > 0 else y0) - c > 0:
             tolerance[r] = epsilon * (abs(p) * reach[k, 0] + abs(q) * reach[k, 1] + abs(c))
-            cutting[r] = _beyond(vertices, k, n, p, q, c) > tolerance[r]
+            beyond[r] = _beyond(vertices[k], n, p, q, c)
+            cutting[r] = beyond[r] > tolerance[r]
             found = found or cutting[r]
     return found
 
 
 @compiled
 @no_type_check
-def _clip_ring(ring, edge, n, A, b, tolerance, cutting, first_row, over, spare, spare_edge):
+def _clip_ring(k, ring, edge, n, A, b, tolerance, beyond, cutting, first_row, over, spare, spare_edge):
     """Cut the ring of n vertices by the rows marked `cutting`, deepest first; row r makes the edge first_row + r.
 
     Returns (n, outcome, shrunk, and for EMPTY the row and the edges that contradict each other).
@@ -74,13 +75,12 @@ def _clip_ring(ring, edge, n, A, b, tolerance, cutting, first_row, over, spare, 
     outcome, shrunk = NONEMPTY, False
     while True:
         row, deepest = -1, 0.0
-        for r in range(len(b)):
+        for r in range(b.shape[1]):
             if cutting[r]:
-                beyond = -np.inf
-                for i in range(n):
-                    beyond = max(beyond, A[r, 0] * ring[i, 0] + A[r, 1] * ring[i, 1] - b[r])
-                cutting[r] = beyond > tolerance[r]
-                depth = beyond / math.sqrt(A[r, 0] ** 2 + A[r, 1] ** 2)
+                if shrunk:
+                    beyond[r] = _beyond(ring, n, A[k, r, 0], A[k, r, 1], b[k, r])
+                cutting[r] = beyond[r] > tolerance[r]
+                depth = beyond[r] / math.sqrt(A[k, r, 0] ** 2 + A[k, r, 1] ** 2)
                 if cutting[r] and depth > deepest:
                     row, deepest = r, depth
         if row < 0:
@@ -88,34 +88,48 @@ def _clip_ring(ring, edge, n, A, b, tolerance, cutting, first_row, over, spare, 
         cutting[row] = False
         slack, inner = tolerance[row], 0
         for i in range(n):
-            over[i] = A[row, 0] * ring[i, 0] + A[row, 1] * ring[i, 1] - b[row]
+            over[i] = A[k, row, 0] * ring[i, 0] + A[k, row, 1] * ring[i, 1] - b[k, row]
             if over[i] < over[inner]:
                 inner = i
         if over[inner] > slack:
-            return n, EMPTY, False, row, edge[(inner - 1) % n], edge[inner]
+            return n, EMPTY, False, row, edge[_before(inner, n)], edge[inner]
         if over[inner] >= -slack:
             outcome = UNDECIDED
             continue
         first = last = inner
-        while over[(first - 1) % n] <= slack:
-            first = (first - 1) % n
-        while over[(last + 1) % n] <= slack:
-            last = (last + 1) % n
-        k = 0
-        for i in range((last - first) % n + 1):
-            j = (first + i) % n
-            spare[k, 0], spare[k, 1], spare_edge[k] = ring[j, 0], ring[j, 1], edge[j]
-            k += 1
+        while over[_before(first, n)] <= slack:
+            first = _before(first, n)
+        while over[_after(last, n)] <= slack:
+            last = _after(last, n)
+        new, j = 0, first
+        while True:
+            spare[new, 0], spare[new, 1], spare_edge[new] = ring[j, 0], ring[j, 1], edge[j]
+            new += 1
+            if j == last:
+                break
+            j = _after(j, n)
         if over[last] < -slack:
-            _cross(spare, k, ring, over, last, (last + 1) % n)
-            k += 1
-        spare_edge[k - 1] = first_row + row
+            _cross(spare, new, ring, over, last, _after(last, n))
+            new += 1
+        spare_edge[new - 1] = first_row + row
         if over[first] < -slack:
-            _cross(spare, k, ring, over, first, (first - 1) % n)
-            spare_edge[k] = edge[(first - 1) % n]
-            k += 1
-        n, shrunk = k, True
+            _cross(spare, new, ring, over, first, _before(first, n))
+            spare_edge[new] = edge[_before(first, n)]
+            new += 1
+        n, shrunk = new, True
         _copy(spare, spare_edge, n, ring, edge)
+
+
+@compiled
+@no_type_check
+def _after(i, n):
+    return i + 1 if i < n - 1 else 0
+
+
+@compiled
+@no_type_check
+def _before(i, n):
+    return i - 1 if i > 0 else n - 1
 
 
 @compiled
@@ -140,11 +154,12 @@ def _merge_ring(ring, edge, n, most, lines, parallel, spare, spare_edge):
     while n > most:
         best, dropped, cx, cy = np.inf, -1, 0.0, 0.0
         for i in range(n):
-            before, after = edge[(i - 1) % n], edge[(i + 1) % n]
+            end = _after(i, n)
+            before, after = edge[_before(i, n)], edge[end]
             p, q, r, s = lines[before, 0], lines[before, 1], lines[after, 0], lines[after, 1]
             turn = p * s - q * r
             if turn > parallel * math.sqrt(p * p + q * q) * math.sqrt(r * r + s * s):
-                x, y = ring[(i + 1) % n, 0] - ring[i, 0], ring[(i + 1) % n, 1] - ring[i, 1]
+                x, y = ring[end, 0] - ring[i, 0], ring[end, 1] - ring[i, 1]
                 extended = (x * r + y * s) / turn
                 added = -extended * (p * x + q * y)
                 if added < best:
@@ -152,10 +167,11 @@ def _merge_ring(ring, edge, n, most, lines, parallel, spare, spare_edge):
                     cx, cy = ring[i, 0] - extended * q, ring[i, 1] + extended * p
         if dropped < 0:
             return n
-        n -= 1
-        for i in range(n):
-            old = (dropped + 1 + i) % (n + 1)
+        old = dropped
+        for i in range(n - 1):
+            old = _after(old, n)
             spare[i, 0], spare[i, 1], spare_edge[i] = ring[old, 0], ring[old, 1], edge[old]
+        n -= 1
         spare[0, 0], spare[0, 1] = cx, cy
         _copy(spare, spare_edge, n, ring, edge)
     return n
@@ -195,70 +211,14 @@ def _widened(polygons, slots):
 
 @compiled
 @no_type_check
-def _scratch(V, R):
-    """Room to clip a ring of V vertices by R rows."""
-    W = V + R + 1
-    return (
-        np.empty(R), np.empty(R, np.bool_), np.empty((W, 2)), np.empty(W, np.int64), np.empty(W), np.empty((W, 2)),
-        np.empty(W, np.int64), np.empty((W, 2)),
-    )  # fmt: skip
-
-
-@compiled
-@no_type_check
-def _no_contradiction(B):
-    return np.full((B, 3, 2), np.nan), np.full((B, 3), np.nan), np.full((B, 3), np.nan), np.full((B, 3), -1)
-
-
-@compiled
-@no_type_check
-def _clip_one(k, given, result, fresh, A, b, stamp, source, most, epsilon, parallel, scratch, found):
-    """Clip polygon k by the rows marked in the scratch and merge what is beyond `most` edges.
-
-    `result` is `given` itself until the first polygon is really cut; then it is a `fresh` copy, which grows on demand.
-    `found` = (A, b, time, source) takes the rows of a contradiction. Returns (result, outcome, shrunk).
-    """
-    vertices, ring_A, ring_b, time, ring_source, count, _ = given
-    tolerance, cutting, ring, edge, over, spare, spare_edge, lines = scratch
-    n, V, R = count[k], ring_b.shape[1], len(b)
-    for i in range(n):
-        ring[i, 0], ring[i, 1], edge[i] = vertices[k, i, 0], vertices[k, i, 1], i
-    n, outcome, shrunk, row, before, after = _clip_ring(
-        ring, edge, n, A, b, tolerance, cutting, V, over, spare, spare_edge
-    )
-    if outcome == EMPTY:
-        for place, e in enumerate((V + row, before, after)):
-            if e >= V:
-                found[0][k, place, 0], found[0][k, place, 1], found[1][k, place] = A[e - V, 0], A[e - V, 1], b[e - V]
-                found[2][k, place], found[3][k, place] = stamp, source[e - V]
-            else:
-                found[0][k, place, 0], found[0][k, place, 1] = ring_A[k, e, 0], ring_A[k, e, 1]
-                found[1][k, place], found[2][k, place], found[3][k, place] = ring_b[k, e], time[k, e], ring_source[k, e]
-    if shrunk and n > most:
-        for i in range(V + R):
-            old = i < V
-            lines[i, 0], lines[i, 1] = (ring_A[k, i, 0], ring_A[k, i, 1]) if old else (A[i - V, 0], A[i - V, 1])
-        n = _merge_ring(ring, edge, n, most, lines, parallel, spare, spare_edge)
-        # Merging that would cost what the cut has gained is not worth it; the areas are sums in some order.
-        shrunk = _area(ring, n) <= _area(vertices[k], count[k]) * (1 - epsilon)
-    if not shrunk:
-        return result, outcome, False
-    if n > result[2].shape[1] or not fresh:
-        result = _widened(result, max(n, result[2].shape[1]))
-    new_vertices, new_A, new_b, new_time, new_source, new_count, _ = result
-    new_count[k] = n
-    for i in range(new_b.shape[1]):
-        j, e = (i, edge[i]) if i < n else (0, -1)
-        new_vertices[k, i, 0], new_vertices[k, i, 1] = ring[j, 0], ring[j, 1]
-        if e >= V:
-            new_A[k, i, 0], new_A[k, i, 1], new_b[k, i] = A[e - V, 0], A[e - V, 1], b[e - V]
-            new_time[k, i], new_source[k, i] = stamp, source[e - V]
-        elif e >= 0:
-            new_A[k, i, 0], new_A[k, i, 1], new_b[k, i] = ring_A[k, e, 0], ring_A[k, e, 1], ring_b[k, e]
-            new_time[k, i], new_source[k, i] = time[k, e], ring_source[k, e]
-        else:
-            new_A[k, i, 0], new_A[k, i, 1], new_b[k, i], new_time[k, i], new_source[k, i] = 0.0, 0.0, 1.0, np.nan, -1
-    return result, outcome, True
+def _small(k, ring, edge, n, ring_A, A, most, parallel, lines, spare, spare_edge):
+    """Merge a ring that has more than `most` edges."""
+    V, R = ring_A.shape[1], A.shape[1]
+    for i in range(V):
+        lines[i, 0], lines[i, 1] = ring_A[k, i, 0], ring_A[k, i, 1]
+    for i in range(R):
+        lines[V + i, 0], lines[V + i, 1] = A[k, i, 0], A[k, i, 1]
+    return _merge_ring(ring, edge, n, most, lines, parallel, spare, spare_edge)
 
 
 @compiled
@@ -266,20 +226,62 @@ def _clip_one(k, given, result, fresh, A, b, stamp, source, most, epsilon, paral
 def clip(polygons, A, b, stamp, source, most, epsilon, parallel):
     """All polygons (vertices, A, b, time, source, count, reach) by their rows A (B, R, 2), b and source (B, R).
 
-    Returns (polygons, outcome, shrunk, contradiction): the same polygons, not copied, if none was cut.
+    Returns (polygons, outcome, shrunk, contradiction): the same polygons, not copied, if none was cut. Those that have
+    more than `most` edges then are merged, or stay as they were if that costs what the cut has gained.
     """
-    B, R = b.shape
-    result, scratch, found = polygons, _scratch(polygons[2].shape[1], R), _no_contradiction(B)
-    outcome, shrunk, fresh = np.empty(B, np.int64), np.empty(B, np.bool_), False
-    vertices, count, reach, tolerance, cutting = polygons[0], polygons[5], polygons[6], scratch[0], scratch[1]
+    vertices, ring_A, ring_b, time, ring_source, count, reach = polygons
+    (B, R), V = b.shape, ring_b.shape[1]
+    W = V + R + 1
+    tolerance, beyond, cutting, over = np.empty(R), np.empty(R), np.empty(R, np.bool_), np.empty(W)
+    ring, spare, lines = np.empty((W, 2)), np.empty((W, 2)), np.empty((W, 2))
+    edge, spare_edge = np.empty(W, np.int64), np.empty(W, np.int64)
+    result, slots = polygons, 0
+    to_vertices, to_A, to_b, to_time, to_source, to_count, _ = polygons
+    outcome, shrunk = np.zeros(B, np.int64), np.zeros(B, np.bool_)
+    lost_A, lost_b = np.full((B, 3, 2), np.nan), np.full((B, 3), np.nan)
+    lost_time, lost_source = np.full((B, 3), np.nan), np.full((B, 3), -1)
     for k in range(B):
-        outcome[k], shrunk[k] = NONEMPTY, False
-        if _any_cuts(vertices, k, count[k], reach, A, b, tolerance, cutting, epsilon):
-            result, outcome[k], shrunk[k] = _clip_one(
-                k, polygons, result, fresh, A[k], b[k], stamp[k], source[k], most, epsilon, parallel, scratch, found
-            )
-            fresh = fresh or shrunk[k]
-    return result, outcome, shrunk, found
+        n = count[k]
+        if not _any_cuts(vertices, k, n, reach, A, b, tolerance, beyond, cutting, epsilon):
+            continue
+        for i in range(n):
+            ring[i, 0], ring[i, 1], edge[i] = vertices[k, i, 0], vertices[k, i, 1], i
+        n, outcome[k], shrunk[k], row, before, after = _clip_ring(
+            k, ring, edge, n, A, b, tolerance, beyond, cutting, V, over, spare, spare_edge
+        )
+        if outcome[k] == EMPTY:
+            for i, e in enumerate((V + row, before, after)):
+                if e >= V:
+                    lost_A[k, i, 0], lost_A[k, i, 1], lost_b[k, i] = A[k, e - V, 0], A[k, e - V, 1], b[k, e - V]
+                    lost_time[k, i], lost_source[k, i] = stamp[k], source[k, e - V]
+                else:
+                    lost_A[k, i, 0], lost_A[k, i, 1], lost_b[k, i] = ring_A[k, e, 0], ring_A[k, e, 1], ring_b[k, e]
+                    lost_time[k, i], lost_source[k, i] = time[k, e], ring_source[k, e]
+        if shrunk[k] and n > most:
+            n = _small(k, ring, edge, n, ring_A, A, most, parallel, lines, spare, spare_edge)
+            # The areas are sums in some order.
+            shrunk[k] = _area(ring, n) <= _area(vertices[k], count[k]) * (1 - epsilon)
+        if not shrunk[k]:
+            continue
+        if n > slots:  # seldom: room grows by eight, and all polygons are copied
+            slots = max((n + 7) // 8 * 8, V)
+            result = _widened(result, slots)
+            to_vertices, to_A, to_b, to_time, to_source, to_count, _ = result
+        to_count[k] = n
+        for i in range(slots):
+            j = i if i < n else 0
+            to_vertices[k, i, 0], to_vertices[k, i, 1] = ring[j, 0], ring[j, 1]
+        for i in range(max(n, count[k])):
+            e = edge[i] if i < n else -1
+            if e >= V:
+                to_A[k, i, 0], to_A[k, i, 1], to_b[k, i] = A[k, e - V, 0], A[k, e - V, 1], b[k, e - V]
+                to_time[k, i], to_source[k, i] = stamp[k], source[k, e - V]
+            elif e >= 0:
+                to_A[k, i, 0], to_A[k, i, 1], to_b[k, i] = ring_A[k, e, 0], ring_A[k, e, 1], ring_b[k, e]
+                to_time[k, i], to_source[k, i] = time[k, e], ring_source[k, e]
+            else:
+                to_A[k, i, 0], to_A[k, i, 1], to_b[k, i], to_time[k, i], to_source[k, i] = 0.0, 0.0, 1.0, np.nan, -1
+    return result, outcome, shrunk, (lost_A, lost_b, lost_time, lost_source)
 
 
 @compiled
