@@ -31,11 +31,11 @@ class Status(IntEnum):
 
 def nearest_point(A: Reals, b: Reals, y: Reals, metric: Reals | None = None) -> tuple:
     """Point, multipliers, active rows, the places they fill, status."""
-    finite = np.isfinite(A.reshape(len(A), -1).sum(-1) + b.sum(-1) + y.sum(-1))
+    finite = np.isfinite(A.sum((1, 2)) + b.sum(-1) + y.sum(-1))
     rows = A
     if metric is not None:
         root, definite = _roots(metric)
-        finite &= definite
+        finite &= definite & np.isfinite(metric.sum((1, 2)))
         rows = _whitened(A, root)
     unit, offsets, impossible = _unit(rows, b - times(A, y), finite)
     found = nearest_rows(unit, offsets)
@@ -64,7 +64,7 @@ def solve_active(N: Reals, filled: Mask, pull: Reals, offsets: Reals, metric: Re
 
 def inscribed_ball(A: Reals, b: Reals) -> tuple:
     """Centre, radius, the rows that decide them (m and above: at infinity), status."""
-    finite = np.isfinite(A.reshape(len(A), -1).sum(-1) + b.sum(-1))
+    finite = np.isfinite(A.sum((1, 2)) + b.sum(-1))
     m, p = A.shape[1:]
     unit, offsets, impossible = _unit(A, b, finite)
     found = inscribed_rows(unit, offsets)

@@ -234,7 +234,10 @@ class _InscribedBall(torch.autograd.Function):
         M, touching, real, rows, index = _InscribedBall._system(A, centre, radius, rows)
         given = torch.cat([of_centre, of_radius.unsqueeze(-1)], dim=-1)
         found = torch.cat([centre, radius.unsqueeze(-1)], dim=-1).isfinite()
-        v = torch.where(real, torch.linalg.solve(M.mT, torch.where(found, given, 0.0)), 0.0)
+        # Not by linalg.solve: its forward derivative over a backward one is wrong under vmap (torch 2.13).
+        given, every = torch.where(found, given, 0.0), torch.ones_like(real)
+        _, v = _SolveActive.apply(M, every, given, torch.zeros_like(given), None)  # type: ignore[misc]
+        v = torch.where(real, v, 0.0)
         of_A = torch.zeros_like(A).scatter_add(-2, index, -v.unsqueeze(-1) * touching)
         return of_A, torch.zeros_like(A[..., 0]).scatter_add(-1, rows, v)
 
@@ -245,7 +248,8 @@ class _InscribedBall(torch.autograd.Function):
         right = torch.zeros_like(M[..., 0]) if db is None else db.gather(-1, rows)
         if dA is not None:
             right = right - (dA.gather(-2, index) * touching).sum(-1)
-        ball = torch.linalg.solve(M, torch.where(real, right, 0.0))
+        right, every = torch.where(real, right, 0.0), torch.ones_like(real)
+        ball, _ = _SolveActive.apply(M, every, torch.zeros_like(right), right, None)  # type: ignore[misc]
         found = centre.isfinite(), radius.isfinite()
         return torch.where(found[0], ball[..., :-1], 0.0), torch.where(found[1], ball[..., -1], 0.0), None, None
 
