@@ -36,8 +36,8 @@ def geometry(found: dict[str, Any]) -> str:
         f"[-10, 10]² and {found['updates']} updates of 6 half-spaces: intersect, drop redundant rows, area, vertices,",
         f"Chebyshev centre. Batches of {found['batch']} sets for torchfsid, one set for the others; CPU time per set",
         "and update. `thin` sets are needles of the given width. Failed: updates that raised, came out empty, lost the",
-        f"truth or had an area off by more than {found['wrong']:.0%}, against exact rationals. A peer that failed starts",
-        "again from the exact set.\n",
+        f"truth or had an area off by more than {found['wrong']:.0%}, against exact rationals. A peer that failed",
+        "starts again from the exact set.\n",
     ]
     for name, rows in found["workloads"].items():
         fastest = rows["fastest peer"]

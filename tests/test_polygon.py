@@ -6,6 +6,7 @@ A row's exact counterpart is the very rationals that its floats are: what differ
 import itertools
 import math
 from collections import Counter
+from collections.abc import Iterator
 from fractions import Fraction
 
 import numpy as np
@@ -26,8 +27,18 @@ from tests.problems import (
     exactly_feasible,
     solve_qp,
 )
+from torchfsid import compiled
 from torchfsid.clipping import Clipped, Outcome, clip, merge
 from torchfsid.polygon import ROUND_OFF, Polygon, round_off
+
+
+@pytest.fixture(scope="module", autouse=True, params=["torch", "compiled"])
+def way(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Everything in this file holds for both ways of computing it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compiled, "installed", lambda: request.param == "compiled")
+        yield
+
 
 BOX = 10.0
 """Half the side of the first box: the size that round-off is measured against."""
