@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 USAGE_ERROR, INTERRUPTED = 2, 130
 
-TABLE_WIDTH = 100
+TABLE_WIDTH, SWEEP_WIDTH = 100, 130
 """Columns that the tables need; a narrower terminal wraps them."""
 
 
@@ -138,7 +138,7 @@ def _sweep(path: Path, out: Path, overrides: Sequence[str], jobs: int, dask: str
     summary = summarise_sweep(out)
     write_json(out / "summary.json", summary)
     _draw(out)
-    print_sweep(summary, Console(width=max(Console().width, TABLE_WIDTH)))
+    print_sweep(summary, Console(width=max(Console().width, SWEEP_WIDTH)))
 
 
 def _draw(folder: Path) -> None:

@@ -67,7 +67,9 @@ def print_sweep(summary: dict[str, Any], console: Console) -> None:
     table = Table(box=SIMPLE_HEAD, padding=(0, 1))
     heads = "runs", "robots", "paper's lost", "silently", "√area", "inv.-opt. lost", "√area", "UKF", "hybrid"
     for i, head in enumerate([*summary["keys"], *heads]):
-        table.add_column(head, justify="left" if i < len(summary["keys"]) else "right")
+        is_key = i < len(summary["keys"])
+        width = max((len(point["point"][i]) for point in summary["points"]), default=0) if is_key else None
+        table.add_column(head, justify="left" if is_key else "right", min_width=width)
     for point in summary["points"]:
         paper, ours = (point[kind] for kind in SETS)
         counts = point["runs"], point["robots"], paper["lost"], paper["lost_in_silence"]

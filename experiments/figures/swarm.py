@@ -50,7 +50,7 @@ def draw_swarm(folder: Path, config: SwarmConfig) -> Figure:
         figure.colorbar(discs, ax=panels[:-1], label="√area of the goal's set [m]", shrink=0.8, pad=0.01)
     _draw_sizes(panels[-1], sizes)
     figure.suptitle(
-        f"{config.title}, {config.steps} steps: truth lost for {summary['truth_outside']}",
+        f"{config.title}, {config.steps} steps: truth lost for {summary['truth_outside']} of {config.robots}",
         fontsize=9,
         x=0.01,
         ha="left",
