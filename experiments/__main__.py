@@ -1,4 +1,4 @@
-"""The command line: `python -m experiments run CONFIG --out DIR`, `... sweep CONFIG --out DIR`, `... figures DIR`.
+"""The command line: `python -m experiments run CONFIG --out DIR`, `... sweep ...`, `... design ...`, `... figures DIR`.
 
 Everything is validated before PyTorch is loaded and before anything is written: a mistake costs one clear line on
 stderr and exit code 2.
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from experiments.config import load_experiment
+from experiments.design.config import load_design
 from experiments.sweep_config import load_sweep
 from torchfsid.errors import ConfigError, FsidError
 
@@ -38,7 +39,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", required=True)
     run = commands.add_parser("run", help="run an experiment and draw its figures")
     sweep = commands.add_parser("sweep", help="finish a sweep: run what is not in its folder yet, and draw its figures")
-    for command in (run, sweep):
+    design = commands.add_parser("design", help="design an observer by gradient, and compare it with others")
+    for command in (run, sweep, design):
         command.add_argument("config", type=Path, metavar="CONFIG", help="YAML, see configs/")
         command.add_argument("--out", type=Path, required=True, metavar="DIR", help="results folder")
         command.add_argument("--set", action="append", default=[], metavar="A.B=VALUE", help="override a key")
@@ -53,6 +55,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _run(chosen.config, chosen.out, chosen.set)
         elif chosen.command == "sweep":
             _sweep(chosen.config, chosen.out, chosen.set, chosen.jobs, chosen.dask)
+        elif chosen.command == "design":
+            _design(chosen.config, chosen.out, chosen.set)
         else:
             _draw(chosen.folder)
     except FsidError as error:
@@ -139,6 +143,23 @@ def _sweep(path: Path, out: Path, overrides: Sequence[str], jobs: int, dask: str
     write_json(out / "summary.json", summary)
     _draw(out)
     print_sweep(summary, Console(width=max(Console().width, SWEEP_WIDTH)))
+
+
+def _design(path: Path, out: Path, overrides: Sequence[str]) -> None:
+    config = load_design(path, overrides)
+    _require_folder(out)
+
+    import torch
+    from rich.console import Console
+    from rich.progress import track
+
+    from experiments.design.run import print_design, run_design
+
+    torch.set_num_threads(1)  # small tensors: more threads only wait for each other
+    progress = Console(stderr=True)
+    summary = run_design(config, out, lambda items, what, total: track(items, what, total, console=progress))
+    _draw(out)
+    print_design(summary, Console(width=max(Console().width, TABLE_WIDTH)))
 
 
 def _draw(folder: Path) -> None:

@@ -8,6 +8,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from experiments.config import CasesConfig, SwarmConfig
+from experiments.design.config import MODELS as DESIGNS
 from experiments.figures.animation import animate
 from experiments.figures.cases import draw_cases
 from experiments.figures.single import draw_single
@@ -33,6 +34,10 @@ def draw(folder: Path) -> list[Path]:
         if kind == "swarm":
             config = load(folder / "config.yaml", SwarmConfig)
             return _save(draw_swarm(folder, config), folder, "figure")
+        if kind in DESIGNS:
+            from experiments.design.figures import draw_design
+
+            return draw_design(folder, _save)
         results = Results(folder)
         config = results.config
         if isinstance(config, CasesConfig):

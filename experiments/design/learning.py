@@ -1,0 +1,181 @@
+"""Train gains through the projection, and compare them with other observers on teams and noise they have not seen.
+
+A run leaves, beside the resolved config.yaml,
+
+    runs.csv       a row per observer, noise and team: the mean error of its robots, over time and at `times` [m]
+    curves.csv     a row per observer, noise and sample: the mean error over all robots [m]
+    training.csv   a row per trained gain and epoch: mean errors on the training and the validation teams [m]
+    answers.csv    what the trained network answers: a row per noise, case and area
+    gains.json     the trained gains, whole
+    summary.json   means, and their differences to plain recursive least squares with standard errors over teams
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from experiments.design.adaptive import AdaptiveObserver, ConstantGain, NetworkGain, RlsGain
+from experiments.design.config import LearnedObserverConfig
+from experiments.design.recordings import Recording, record
+from experiments.design.tables import Track, write_rows
+from torchfsid.documents import dump
+from torchfsid.kkt import CASES
+from torchfsid.results import write_json
+
+
+def learn(config: LearnedObserverConfig, out: Path, track: Track) -> dict[str, Any]:
+    """Simulate, train, compare, and write everything but the figures; returns the summary."""
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "config.yaml").write_text(dump(config), encoding="utf-8")
+    levels = len(config.noise)
+    train_seed, validation_seed, test_seed, start_seed = np.random.SeedSequence(config.seed).spawn(4)
+    seeds = [*train_seed.spawn(levels), *validation_seed.spawn(levels)]
+    counts = [config.teams.train] * levels + [config.teams.validation] * levels
+    jobs = list(zip(config.noise * 2, counts, seeds, strict=True))
+    seen = [record(config, *job, filters=False) for job in track(jobs, "Simulating", len(jobs))]
+    training, validation = seen[:levels], seen[levels:]
+
+    tuned = min(config.gains, key=lambda share: float(_error(_constant(config, share), validation)))
+    torch.manual_seed(int(start_seed.generate_state(1)[0]))
+    prior = torch.tensor(config.prior.upper) - torch.tensor(config.prior.lower)
+    network = NetworkGain(config.training.hidden, float(prior.prod()), float(np.median(config.noise)))
+    constant, curves = ConstantGain(tuned, config.gain), []
+    learned = {
+        "constant, learned": AdaptiveObserver(constant),
+        "network": AdaptiveObserver(network),
+    }
+    for name, observer in learned.items():
+        curves += train(name, observer, training, validation, config, track)
+    observers = {
+        "constant": _constant(config, tuned),
+        **learned,
+        "RLS": AdaptiveObserver(RlsGain()),
+        "constant, not projected": AdaptiveObserver(ConstantGain(tuned, config.gain), projects=False),
+        "RLS, not projected": AdaptiveObserver(RlsGain(), projects=False),
+    }
+
+    runs: list[dict[str, Any]] = []
+    samples: list[dict[str, Any]] = []
+    jobs = list(zip(config.unseen_noise, test_seed.spawn(len(config.unseen_noise)), strict=True))
+    contains = {}
+    for noise, seed in track(jobs, "Comparing", len(jobs)):
+        recording = record(config, noise, config.teams.test, seed, filters=True)
+        contains[str(noise)] = recording.contains
+        with torch.no_grad():
+            estimates = recording.estimates | {name: of(*_inputs(recording)) for name, of in observers.items()}
+        for name, of in estimates.items():
+            error = (of - recording.goals).norm(dim=-1)
+            samples += [
+                {"observer": name, "noise": noise, "t": k * config.dt, "error": e}
+                for k, e in enumerate(error.mean(1).tolist())
+            ]
+            runs += _rows(name, noise, error, config)
+
+    write_rows(out / "runs.csv", runs)
+    write_rows(out / "curves.csv", samples)
+    write_rows(out / "training.csv", curves)
+    write_rows(out / "answers.csv", _answers(network, config))
+    states = {name: {key: value.tolist() for key, value in of.state_dict().items()} for name, of in learned.items()}
+    write_json(out / "gains.json", states)
+    summary = {
+        "title": config.title,
+        "seed": config.seed,
+        "hand-tuned gain times kp^2": tuned,
+        "learned gain times kp^2": float(constant.log_share.exp()),
+        "share of samples at which the set holds the truth": contains,
+        **summarise(runs, config),
+    }
+    write_json(out / "summary.json", summary)
+    return summary
+
+
+def train(
+    name: str,
+    observer: AdaptiveObserver,
+    training: Sequence[Recording],
+    validation: Sequence[Recording],
+    config: LearnedObserverConfig,
+    track: Track,
+) -> list[dict[str, Any]]:
+    """Minimise the mean error over robots and time by Adam, and keep the epoch that is best on the validation teams.
+    Returns a row per epoch; epoch 0 is untrained."""
+    optimiser = torch.optim.Adam(observer.parameters(), lr=config.training.learning_rate)
+    best, lowest, rows = copy.deepcopy(observer.state_dict()), float("inf"), []
+    for epoch in track(range(config.training.epochs + 1), f"Training: {name}", config.training.epochs + 1):
+        with torch.no_grad():
+            held_out = float(_error(observer, validation))
+        if held_out < lowest:
+            best, lowest = copy.deepcopy(observer.state_dict()), held_out
+        loss = _error(observer, training)
+        rows.append({"gain": name, "epoch": epoch, "training": float(loss.detach()), "validation": held_out})
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    observer.load_state_dict(best)
+    return rows
+
+
+def _constant(config: LearnedObserverConfig, share: float) -> AdaptiveObserver:
+    return AdaptiveObserver(ConstantGain(share, config.gain)).requires_grad_(False)
+
+
+def _inputs(recording: Recording) -> tuple[Any, ...]:
+    return recording.steps, recording.theta, recording.information
+
+
+def _error(observer: nn.Module, recordings: Sequence[Recording]) -> Float[Tensor, ""]:
+    """Mean distance to the goal over robots, time and levels of noise [m]."""
+    errors = [(observer(*_inputs(recording)) - recording.goals).norm(dim=-1).mean() for recording in recordings]
+    return torch.stack(errors).mean()
+
+
+def _rows(name: str, noise: float, error: Float[Tensor, "T B"], config: LearnedObserverConfig) -> list[dict[str, Any]]:
+    of_teams = error.reshape(len(error), config.teams.test, -1).mean(-1)
+    at = {f"at {t} s": of_teams[min(round(t / config.dt), len(error) - 1)].tolist() for t in config.times}
+    columns = {"mean": of_teams.mean(0).tolist(), **at}
+    return [
+        {"observer": name, "noise": noise, "team": team, **{key: of[team] for key, of in columns.items()}}
+        for team in range(config.teams.test)
+    ]
+
+
+def _answers(network: NetworkGain, config: LearnedObserverConfig) -> list[dict[str, Any]]:
+    """Distrust and memory over sizes of Theta from the prior's down to where noise leaves it."""
+    shares = torch.logspace(-6, 0, 25, dtype=torch.float64)
+    rows = []
+    for noise in config.noise:
+        for case, letter in enumerate(CASES):
+            with torch.no_grad():
+                index = torch.full((len(shares),), case)
+                distrust, memory = network.answer(shares * network.prior_area, index, noise)
+            columns = zip((shares * network.prior_area).tolist(), distrust.tolist(), memory.tolist(), strict=True)
+            rows += [{"noise": noise, "case": letter, "area": a, "distrust": s, "memory": r} for a, s, r in columns]
+    return rows
+
+
+def summarise(runs: list[dict[str, Any]], config: LearnedObserverConfig) -> dict[str, Any]:
+    """By noise and observer: mean errors, and the paired difference to `RLS` with its standard error over teams."""
+    table: dict[str, Any] = {}
+    keys = [key for key in runs[0] if key not in ("observer", "noise", "team")]
+    for noise in config.unseen_noise:
+        of_noise = [row for row in runs if row["noise"] == noise]
+        names = list(dict.fromkeys(row["observer"] for row in of_noise))
+        errors = {name: np.array([row["mean"] for row in of_noise if row["observer"] == name]) for name in names}
+        table[str(noise)] = {
+            name: {key: float(np.mean([r[key] for r in of_noise if r["observer"] == name])) for key in keys}
+            | _paired(errors[name] - errors["RLS"])
+            for name in names
+        }
+    return {"mean errors by noise [m]": table}
+
+
+def _paired(difference: np.ndarray) -> dict[str, float]:
+    return {"minus RLS": float(difference.mean()), "standard error": float(difference.std() / len(difference) ** 0.5)}

@@ -1,0 +1,212 @@
+"""Place probes in many corridors by every method, and write down what came of it.
+
+A run leaves, beside the resolved config.yaml,
+
+    runs.csv             a row per corridor, number of way-points and method: the mean area over the held-out goals, the
+                         number of simulations (a placement with a goal), the seconds it took
+    placements.json      per corridor its obstacles, and the placement that each method chose
+    landscape.csv        first corridor: the mean area over the validation goals for a still probe on a grid of places
+    descent.csv          first corridor: where Adam's starts went
+    gradient_check.csv   the gradient of the mean over goals against central differences
+    replay.json          first corridor, one goal: what happens without a probe and with those that were chosen
+    summary.json         means over corridors, and how many times smaller they are
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from experiments.design.config import ProbePlacementConfig
+from experiments.design.gradient_check import check_gradients
+from experiments.design.probe import Probing, along
+from experiments.design.search import METHODS, Evaluated, Search, choose
+from experiments.design.tables import Track, write_rows
+from torchfsid.documents import dump
+from torchfsid.results import write_json
+
+SHOWN = ("random", "adam")
+"""The methods whose choices are replayed."""
+
+
+def place(config: ProbePlacementConfig, out: Path, track: Track) -> dict[str, Any]:
+    """Search, compare, and write everything but the figures; returns the summary."""
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "config.yaml").write_text(dump(config), encoding="utf-8")
+    checking, *seeds = np.random.SeedSequence(config.seed).spawn(1 + config.scenes)
+    corridors = [_Corridor(config, seed) for seed in seeds]
+    runs: list[dict[str, Any]] = []
+    jobs = [(i, K, method) for i in range(len(corridors)) for K in config.way_points for method in _methods(K)]
+    for i, K, method in track(jobs, "Searching", len(jobs)):
+        runs += [{"corridor": i, "way_points": K, **row} for row in corridors[i].compare(K, method)]
+    write_rows(out / "runs.csv", runs)
+    write_json(out / "placements.json", [corridor.record() for corridor in corridors])
+
+    first = corridors[0]
+    write_rows(out / "landscape.csv", first.landscape(track))
+    write_rows(out / "descent.csv", first.descent)
+    write_json(out / "replay.json", first.replay())
+    checks = check_gradients(config, checking, track)
+    write_rows(out / "gradient_check.csv", checks)
+    summary = {"title": config.title, "seed": config.seed, "set": config.set} | summarise(runs, checks)
+    write_json(out / "summary.json", summary)
+    return summary
+
+
+def _methods(way_points: int) -> list[str]:
+    """A grid of way-points would need the power 2 K of the places along an axis."""
+    return [*(["grid"] if way_points == 1 else []), *METHODS]
+
+
+class _Corridor:
+    """One corridor, its goals, and what was chosen for it."""
+
+    def __init__(self, config: ProbePlacementConfig, seed: np.random.SeedSequence):
+        moving, drawing, self._searching = seed.spawn(3)
+        shift = np.random.default_rng(moving).uniform(-config.jitter, config.jitter, (len(config.obstacles), 2))
+        self.config, self.probing = config, Probing.of(config, torch.from_numpy(shift))
+        counts = (config.goals.train, config.goals.validation, config.goals.test)
+        states = drawing.generate_state(3).tolist()
+        self.train, self.validation, self.test = map(self.probing.draw_goals, counts, states)
+        self.chosen: dict[int, dict[str, Tensor]] = {}
+        self.descent: list[dict[str, Any]] = []
+
+    def compare(self, K: int, method: str) -> list[dict[str, Any]]:
+        """What a method comes to; `random` answers for no probe and for a single random placement too."""
+        started = time.perf_counter()
+        # Every method meets the same randomness: the same starts, the same random places.
+        seed = np.random.SeedSequence(self._searching.entropy, spawn_key=(*self._searching.spawn_key, K))
+        search = Search.of(self.probing, self.train, K, seed)
+        found = self._on_grid(search) if method == "grid" else METHODS[method](search)
+        chosen = choose(search, found, self.validation)
+        seconds = time.perf_counter() - started
+        self.chosen.setdefault(K, {})[method] = chosen
+        if method == "adam":
+            self.descent += _descent(K, found)
+        simulations = sum(map(len, found.means)) * self.config.goals.train
+        simulations += self.config.search.finalists * self.config.goals.validation
+        rows = [self._judge(method, chosen, simulations, seconds)]
+        if method == "random":
+            several = torch.cat(found.placements)[: self.config.search.finalists]
+            rows += [self._judge("none", None, 0, 0.0), self._judge("one_random", several, 0, 0.0)]
+        return rows
+
+    def _judge(self, method: str, placements: Tensor | None, simulations: int, seconds: float) -> dict[str, Any]:
+        with torch.no_grad():
+            outcome = self.probing.outcome(placements, self.test)
+        return {
+            "method": method,
+            "mean_area": float(outcome.area.mean()),
+            "geometric_mean_area": float(outcome.area.log().mean().exp()),
+            "sound": float(outcome.sound.double().mean()),
+            "simulations": simulations,
+            "seconds": seconds,
+        }
+
+    def _on_grid(self, search: Search) -> Evaluated:
+        """As many places as the others try, on a grid."""
+        found, settings = Evaluated(), self.config.search
+        lower, upper = self.probing.room
+        width, height = (upper - lower).tolist()
+        columns = max(1, round((settings.starts * settings.steps * width / height) ** 0.5))
+        places = _grid(self.probing, columns, settings.starts * settings.steps // columns)
+        for chunk in self.probing.allowed(places.unsqueeze(1)).split(settings.starts):
+            found.add(chunk, search.evaluate(chunk))
+        return found
+
+    def landscape(self, track: Track) -> list[dict[str, Any]]:
+        """Places that are not allowed have no area."""
+        places = _grid(self.probing, *self.config.landscape)
+        allowed = (places - self.probing.start).norm(dim=-1) >= self.config.safety_distance
+        means = torch.full((len(places),), torch.nan, dtype=torch.float64)
+        chunks = allowed.nonzero().flatten().split(self.config.search.starts)
+        for items in track(chunks, "Landscape", len(chunks)):
+            with torch.no_grad():
+                means[items] = self.probing.outcome(places[items].unsqueeze(1), self.validation).area.mean(-1)
+        rows = zip(places.tolist(), means.tolist(), strict=True)
+        return [{"x": x, "y": y, "mean_area": "" if mean != mean else mean} for (x, y), mean in rows]
+
+    def record(self) -> dict[str, Any]:
+        chosen = {
+            str(K): {name: placement[0].tolist() for name, placement in of.items()} for K, of in self.chosen.items()
+        }
+        return {"obstacles": self.probing.obstacles.tolist(), "chosen": chosen}
+
+    def replay(self) -> dict[str, Any]:
+        """For the goal whose area with the last, most movable probe of Adam is the median one."""
+        K = max(self.chosen)
+        with torch.no_grad():
+            areas = self.probing.outcome(self.chosen[K]["adam"], self.test).area[0]
+        goal = self.test[areas.argsort()[len(areas) // 2]].unsqueeze(0)
+        shown = [("none", 0, None)]
+        shown += [(method, K, of[method]) for K, of in self.chosen.items() for method in SHOWN]
+        runs = [{"method": method, "way_points": K, **self._replay(at, goal)} for method, K, at in shown]
+        return {"goal": goal[0].tolist(), "obstacles": self.probing.obstacles.tolist(), "runs": runs}
+
+    def _replay(self, placement: Tensor | None, goal: Tensor) -> dict[str, Any]:
+        samples = []
+        with torch.no_grad():
+            for k, sample in enumerate(self.probing.samples(placement, goal)):
+                theta_set, kkt = sample.estimate.feasible_set, sample.estimate.kkt
+                share = k / max(self.config.steps - 1, 1)
+                samples.append(
+                    {
+                        "t": sample.measurement.t,
+                        "x": sample.measurement.x[0].tolist(),
+                        "probe": None if placement is None else along(placement, share)[0].tolist(),
+                        "active": kkt.active[0].nonzero().flatten().tolist(),
+                        "vertices": theta_set.vertices()[0].tolist(),
+                        "area": float(theta_set.volume()[0]),
+                    }
+                )
+        return {"way_point_places": None if placement is None else placement[0].tolist(), "samples": samples}
+
+
+def _grid(probing: Probing, columns: int, rows: int) -> Tensor:
+    """Middles of the cells of a grid over the room, row by row."""
+    lower, upper = probing.room
+    x, y = ((torch.arange(count, dtype=torch.float64) + 0.5) / count for count in (columns, rows))
+    return lower + (upper - lower) * torch.cartesian_prod(y, x).flip(-1)
+
+
+def _descent(K: int, found: Evaluated) -> list[dict[str, Any]]:
+    return [
+        {"way_points": K, "step": step, "start": i, "mean_area": mean}
+        | {f"{axis}{k}": q[k][j] for k in range(K) for j, axis in enumerate("xy")}
+        for step, (placements, means) in enumerate(zip(found.placements, found.means, strict=True))
+        for i, (q, mean) in enumerate(zip(placements.tolist(), means.tolist(), strict=True))
+        if K == 1
+    ]
+
+
+def summarise(runs: list[dict[str, Any]], checks: list[dict[str, Any]]) -> dict[str, Any]:
+    """Means over corridors; every method against one random placement and the best of equally many."""
+    table: dict[str, Any] = {}
+    for K in dict.fromkeys(row["way_points"] for row in runs):
+        of_K = [row for row in runs if row["way_points"] == K]
+        areas = {
+            name: np.array([row["mean_area"] for row in of_K if row["method"] == name])
+            for name in dict.fromkeys(row["method"] for row in of_K)
+        }
+        table[str(K)] = {
+            name: {
+                "mean area": float(of.mean()),
+                "standard error": float(of.std() / len(of) ** 0.5),
+                "one random / this": float(areas["one_random"].mean() / of.mean()),
+                "this / best of random": float(of.mean() / areas["random"].mean()),
+                "not above best of random": int((of <= areas["random"]).sum()),
+                "least share of goals that count": min(r["sound"] for r in of_K if r["method"] == name),
+                "simulations": max(r["simulations"] for r in of_K if r["method"] == name),
+                "seconds": float(np.mean([r["seconds"] for r in of_K if r["method"] == name])),
+            }
+            for name, of in areas.items()
+        }
+    cosines = {
+        f"{row['objective']}, {row['horizon']} samples, {row['way_points']} way-points": row["cosine"] for row in checks
+    }
+    return {"corridors": len({row["corridor"] for row in runs}), "areas [m^2]": table, "gradient cosines": cosines}

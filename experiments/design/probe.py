@@ -1,0 +1,189 @@
+r"""A probing obstacle near a robot, and what is left of the set of possible goals because of it.
+
+The robot avoids the probe like any other body, so the probe changes which rows are active, and with them what the
+motion says about the goal (the paper's first future work). A placement is K way-points q_1 .. q_K [m]: the probe stands
+still at q_1 (K = 1) or moves along the way-points at equal times from the first sample to the last.
+
+What is minimised is the mean over goals theta, drawn from the current set Theta_0, of A or of log A, where
+A(theta, q) is the area of Theta(T) that the observer ends with if theta is the true goal.
+
+The gradient of a mean over goals is not the mean of the gradients. As a function of q each goal's A is smooth except
+where the history of active sets switches; there it jumps, and automatic differentiation does not see jumps. Let the
+histories be i = 1, 2, ... . If Theta(T) is the same set for all goals of a history, namely the set of these goals, the
+probability of history i is P_i = A_i/A_0. For phi_i = phi(A_i),
+
+    grad sum_i P_i phi_i = sum_i P_i grad phi_i + sum_i phi_i grad P_i = mean(grad phi) + mean(phi grad log A),
+
+since grad P_i = P_i grad log A_i; and as sum_i grad P_i = 0, any constant may be taken off phi. The second term is what
+a change of the probabilities contributes. Automatic differentiation of
+
+    L = mean(phi) + mean((phi - mean phi).detach() log A)
+
+gives both. Without it mean(grad log A) = grad (sum_i A_i)/A_0 = 0: exactly nothing; and for phi = A, since
+A grad log A = grad A, exactly half of the gradient. The condition holds for critical regions at the first sample, and
+for as long as the motion does not depend on the goal (G = 0). Goals whose motion differs cut the set differently; then
+L is an approximation (docs/design.md measures it).
+
+Nothing is learned (A = A_0, and no gradient) from a goal for which a QP has no solution, an intersection is empty, an
+alarm is raised, or the probe comes closer to the robot than the safety distance: an optimiser would use them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from experiments.design.config import BoxConfig, ProbePlacementConfig
+from experiments.design.rollout import closed_loop
+from torchfsid.feasible_set import FeasibleSet
+from torchfsid.inverse_optimal import NoiseBound
+from torchfsid.measurement import Measurement
+from torchfsid.observer import SetEstimate, SetMembershipObserver, Status
+from torchfsid.tasks import GoalTask
+
+Objective = Literal["area", "log_area"]
+
+TOUCHING = 1e-9
+"""Round-off allowed in the distance between probe and robot [m]."""
+
+
+class Sample(NamedTuple):
+    """What is seen of a batch (placements, goals) at a time, what is left of Theta, and whether it counts."""
+
+    measurement: Measurement
+    estimate: SetEstimate
+    sound: Bool[Tensor, "B"]
+
+
+class Outcome(NamedTuple):
+    """The area of Theta(T) [m^2], that of Theta_0 where nothing is learned; is the outcome one that counts?"""
+
+    area: Float[Tensor, "P S"]
+    sound: Bool[Tensor, "P S"]
+
+
+@dataclass(frozen=True)
+class Probing:
+    """A robot in a corridor, what is known of its goal, and the room for a probe.
+
+    Attributes:
+        obstacles: of the corridor [m]. start: of the robot [m].
+    """
+
+    config: ProbePlacementConfig
+    obstacles: Float[Tensor, "m 2"]
+    start: Float[Tensor, "2"]
+
+    @classmethod
+    def of(cls, config: ProbePlacementConfig, shift: Float[Tensor, "m 2"] | float = 0.0) -> Probing:
+        """The config's scene, its obstacles moved by `shift` [m]."""
+        obstacles = torch.tensor(config.obstacles, dtype=torch.float64) + shift
+        return cls(config, obstacles, torch.tensor(config.start, dtype=torch.float64))
+
+    @property
+    def prior(self) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
+        return _box(self.config.prior)
+
+    @property
+    def room(self) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
+        return _box(self.config.room)
+
+    @property
+    def prior_area(self) -> float:
+        lower, upper = self.prior
+        return float((upper - lower).prod())
+
+    def draw_goals(self, count: int, seed: int) -> Float[Tensor, "count 2"]:
+        """Goals of Theta_0, evenly spread (scrambled Sobol points)."""
+        lower, upper = self.prior
+        return lower + (upper - lower) * torch.quasirandom.SobolEngine(2, True, seed).draw(count, dtype=torch.float64)
+
+    def allowed(self, placements: Float[Tensor, "P K 2"]) -> Float[Tensor, "P K 2"]:
+        """The nearest placements in the room whose first way-point keeps the safety distance to the robot's start."""
+        lower, upper = self.room
+        placements = placements.clamp(lower, upper)
+        away = placements[:, 0] - self.start
+        distance = away.norm(dim=-1, keepdim=True)
+        outward = torch.where(distance > 0, away / distance, away.new_tensor([1.0, 0.0]))
+        Ds = self.config.safety_distance
+        first = torch.where(distance < Ds, self.start + Ds * (1 + TOUCHING) * outward, placements[:, 0])
+        return torch.cat([first.unsqueeze(1), placements[:, 1:]], dim=1)
+
+    def samples(
+        self, placements: Float[Tensor, "P K 2"] | None, goals: Float[Tensor, "S 2"], steps: int | None = None
+    ) -> Iterator[Sample]:
+        """Every placement with every goal, P x S items; without a placement, the goals alone."""
+        config, S = self.config, len(goals)
+        P, K = (1, 0) if placements is None else placements.shape[:2]
+        B, steps = P * S, steps or config.steps
+        standing = self.obstacles.expand(B, *self.obstacles.shape)
+        task, barriers = GoalTask(config.gain), [config.avoidance.build([])]
+        lower, upper = self.prior
+        observer = SetMembershipObserver(
+            task,
+            barriers,
+            FeasibleSet.from_box(lower.expand(B, 2), upper.expand(B, 2)),
+            kind=config.set,
+            noise=NoiseBound(config.velocity_noise) if config.set == "inverse_optimal" else None,
+            active_tolerance=config.active_tolerance,
+        )
+
+        def bodies(k: int, _: Tensor) -> Tensor:
+            if placements is None:
+                return standing
+            probe = along(placements, k / max(config.steps - 1, 1))
+            return torch.cat([standing, probe.repeat_interleave(S, dim=0).unsqueeze(1)], dim=1)
+
+        loop = closed_loop(
+            task,
+            barriers,
+            goals.repeat(P, 1),
+            self.start.expand(B, 2),
+            bodies,
+            torch.ones(B, len(self.obstacles) + (K > 0), dtype=torch.bool),
+            dt=config.dt,
+            steps=steps,
+        )
+        sound = torch.ones(B, dtype=torch.bool)
+        for seen in loop:
+            estimate = observer.update(seen.measurement)
+            sound = sound & seen.feasible & (estimate.status == Status.OK)
+            if K > 0:
+                apart = (seen.measurement.x - seen.measurement.bodies[:, -1]).detach().norm(dim=-1)
+                sound = sound & (apart >= config.safety_distance - TOUCHING)
+            yield Sample(seen.measurement, estimate, sound)
+
+    def outcome(
+        self, placements: Float[Tensor, "P K 2"] | None, goals: Float[Tensor, "S 2"], steps: int | None = None
+    ) -> Outcome:
+        """What every placement comes to with every goal, after all samples or the first `steps`."""
+        for sample in self.samples(placements, goals, steps):
+            last = sample
+        area = torch.where(last.sound, last.estimate.feasible_set.volume(), self.prior_area)
+        return Outcome(area.reshape(-1, len(goals)), last.sound.reshape(-1, len(goals)))
+
+
+def along(placements: Float[Tensor, "P K 2"], fraction: float) -> Float[Tensor, "P 2"]:
+    """Where the probe is after this fraction of the time."""
+    K = placements.shape[1]
+    i = min(int(fraction * (K - 1)), max(K - 2, 0))
+    share = fraction * (K - 1) - i
+    return placements[:, i] if K == 1 else (1 - share) * placements[:, i] + share * placements[:, i + 1]
+
+
+def expectation(area: Float[Tensor, "P S"], objective: Objective) -> Float[Tensor, "P"]:
+    """The mean over goals of A or log A, with the gradient of that mean: L, see the module's head, has the value of
+    mean(phi) since the second term's own mean is taken off."""
+    log_area = area.log()
+    phi = area if objective == "area" else log_area
+    weight = (phi - phi.mean(-1, keepdim=True)).detach()
+    return phi.mean(-1) + (weight * (log_area - log_area.detach())).mean(-1)
+
+
+def _box(box: BoxConfig) -> tuple[Tensor, Tensor]:
+    return torch.tensor(box.lower, dtype=torch.float64), torch.tensor(box.upper, dtype=torch.float64)

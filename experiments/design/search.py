@@ -1,0 +1,167 @@
+r"""Where to put the probe: one gradient method, and what it has to beat at the same number of simulations.
+
+Every method evaluates `starts` x `steps` placements on the same training goals. Its `finalists`, the placements with
+the smallest mean areas, are compared on the validation goals; the best of them is its answer, to be judged on goals
+that no method has seen.
+
+    one_random    a place drawn from the room; nothing is compared
+    random        the best of as many places drawn from the room
+    near_path     the best of as many places drawn near the path predicted without a probe
+    cem           the cross-entropy method: generations from a Gaussian fitted to the best of the generation before
+    adam          Adam from many starts near the predicted path, projected onto the allowed placements
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from experiments.design.probe import Probing, expectation
+
+COARSEST = 1e-3
+"""The Gaussian of the cross-entropy method keeps at least this standard deviation [m]."""
+
+TURN = 1.0
+"""Standard deviation of the way from one way-point to the next around the robot [rad]."""
+
+
+@dataclass
+class Evaluated:
+    """Placements in the order of their evaluation, and their mean areas over the training goals [m^2]."""
+
+    placements: list[Float[Tensor, "P K 2"]] = field(default_factory=list)
+    means: list[Float[Tensor, "P"]] = field(default_factory=list)
+
+    def add(self, placements: Float[Tensor, "P K 2"], areas: Float[Tensor, "P S"]) -> Float[Tensor, "P"]:
+        self.placements.append(placements.detach().clone())
+        self.means.append(areas.detach().mean(-1))
+        return self.means[-1]
+
+
+@dataclass(frozen=True)
+class Search:
+    """What the methods share: the scene, the goals to search with, the predicted path, randomness."""
+
+    probing: Probing
+    goals: Float[Tensor, "S 2"]
+    path: Float[Tensor, "T 2"]
+    way_points: int
+    random: np.random.Generator
+
+    @classmethod
+    def of(cls, probing: Probing, goals: Float[Tensor, "S 2"], way_points: int, seed: np.random.SeedSequence) -> Search:
+        return cls(probing, goals, predicted_path(probing, goals), way_points, np.random.default_rng(seed))
+
+    def anywhere(self, count: int) -> Float[Tensor, "P K 2"]:
+        """Way-points drawn evenly from the room."""
+        lower, upper = self.probing.room
+        even = torch.from_numpy(self.random.uniform(size=(count, self.way_points, 2)))
+        return self.probing.allowed(lower + (upper - lower) * even)
+
+    def near_path(self, count: int) -> Float[Tensor, "P K 2"]:
+        """A probe that stands still is drawn near any point of the predicted path. A way-point is drawn on a ring, the
+        safety distance and a little more, around the point where the robot will be then, each some way around the
+        ring from the one before."""
+        config, T, K = self.probing.config, len(self.path), self.way_points
+        spread = config.search.spread
+        if K == 1:
+            at = torch.from_numpy(self.random.integers(T, size=(count, 1)))
+            return self.probing.allowed(
+                self.path[at] + spread * torch.from_numpy(self.random.normal(size=(count, 1, 2)))
+            )
+        at = torch.linspace(0, T - 1, K).round().long()
+        turns = self.random.normal(size=(count, K)) * TURN
+        turns[:, 0] = self.random.uniform(0, 2 * np.pi, size=count)
+        angle = torch.from_numpy(turns.cumsum(-1))
+        radius = config.safety_distance + spread * torch.from_numpy(self.random.normal(size=(count, K))).abs()
+        ring = radius.unsqueeze(-1) * torch.stack([angle.cos(), angle.sin()], dim=-1)
+        return self.probing.allowed(self.path[at] + ring)
+
+    def evaluate(self, placements: Float[Tensor, "P K 2"]) -> Float[Tensor, "P S"]:
+        with torch.no_grad():
+            return self.probing.outcome(placements, self.goals).area
+
+
+def predicted_path(probing: Probing, goals: Float[Tensor, "S 2"]) -> Float[Tensor, "T 2"]:
+    """Where the robot goes without a probe, on average over its possible goals [m]."""
+    with torch.no_grad():
+        return torch.stack([sample.measurement.x.mean(0) for sample in probing.samples(None, goals)])
+
+
+def drawn(draw: Callable[[Search, int], Tensor]) -> Callable[[Search], Evaluated]:
+    def method(search: Search) -> Evaluated:
+        found, settings = Evaluated(), search.probing.config.search
+        for _ in range(settings.steps):
+            placements = draw(search, settings.starts)
+            found.add(placements, search.evaluate(placements))
+        return found
+
+    return method
+
+
+def cem(search: Search) -> Evaluated:
+    """The cross-entropy method (R. Rubinstein, 1999), axis by axis, its first generation near the predicted path."""
+    found, settings = Evaluated(), search.probing.config.search
+    elite = max(2, round(settings.elite * settings.starts))
+    placements = search.near_path(settings.starts)
+    for _ in range(settings.steps):
+        order = found.add(placements, search.evaluate(placements)).argsort()
+        best = placements[order[:elite]]
+        mean, spread = best.mean(0), best.std(0).clamp(min=COARSEST)
+        normal = torch.from_numpy(search.random.normal(size=tuple(placements.shape)))
+        placements = search.probing.allowed(mean + spread * normal)
+    return found
+
+
+def adam(search: Search) -> Evaluated:
+    """Adam on all starts at a time, after each step the nearest allowed placements; half-way, the best quarter goes on
+    alone with four times as many steps, of a length that falls to zero."""
+    found, settings = Evaluated(), search.probing.config.search
+    first, kept = (settings.steps + 1) // 2, max(settings.starts // 4, 1)
+    placements, means = _descend(search, found, search.near_path(settings.starts), first, None)
+    last = (settings.steps - first) * settings.starts // kept
+    _descend(search, found, placements[means.argsort()[:kept]], last, last)
+    return found
+
+
+def _descend(
+    search: Search, found: Evaluated, placements: Float[Tensor, "P K 2"], steps: int, falling: int | None
+) -> tuple[Float[Tensor, "P K 2"], Float[Tensor, "P"]]:
+    """The placements after so many steps of Adam, and the mean areas of those before the last step."""
+    settings = search.probing.config.search
+    placements = placements.clone().requires_grad_()
+    optimiser = torch.optim.Adam([placements], lr=settings.learning_rate)
+    means = placements.new_zeros(len(placements))
+    for k in range(steps):
+        if falling is not None:
+            optimiser.param_groups[0]["lr"] = settings.learning_rate * (1 - k / falling)
+        areas = search.probing.outcome(placements, search.goals).area
+        means = found.add(placements, areas)
+        optimiser.zero_grad()
+        expectation(areas, settings.objective).sum().backward()
+        optimiser.step()
+        with torch.no_grad():
+            placements.copy_(search.probing.allowed(placements))
+    return placements.detach(), means
+
+
+METHODS: dict[str, Callable[[Search], Evaluated]] = {
+    "random": drawn(Search.anywhere),
+    "near_path": drawn(Search.near_path),
+    "cem": cem,
+    "adam": adam,
+}
+
+
+def choose(search: Search, found: Evaluated, goals: Float[Tensor, "S 2"]) -> Float[Tensor, "1 K 2"]:
+    """The finalist with the smallest mean area over other goals."""
+    finalists = torch.cat(found.means).argsort()[: search.probing.config.search.finalists]
+    placements = torch.cat(found.placements)[finalists]
+    with torch.no_grad():
+        best = search.probing.outcome(placements, goals).area.mean(-1).argmin()
+    return placements[best : best + 1]
