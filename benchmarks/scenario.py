@@ -49,12 +49,12 @@ class Fleet:
 
     def __init__(self, robots: int, noisy: bool = False, seed: int = 0) -> None:
         self.error = ERROR if noisy else 0.0
-        self.rng, self.half = np.random.default_rng(seed), float(np.sqrt(robots))
+        self.rng, self.half = np.random.default_rng(seed), float(np.ceil(np.sqrt(robots)))
         self.goals = self._places(robots)
 
     def _places(self, robots: int) -> Tensor:
         """One in each cell of a grid of 2 m, in random order: nobody starts closer than 0.5 m to another."""
-        side = int(np.ceil(np.sqrt(robots)))
+        side = int(self.half)
         cell = self.rng.permutation(side * side)[:robots]
         corner = np.stack([cell % side, cell // side], axis=-1) * 2.0 - self.half
         return torch.from_numpy(corner + self.rng.uniform(0.25, 1.75, (robots, 2)))

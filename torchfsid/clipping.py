@@ -1,8 +1,9 @@
 r"""Intersecting batched polygons with half-spaces, and keeping them small.
 
-While a polygon is cut by more than round-off, cut it by the row that cuts it deepest; only polygons that are really cut
-are touched, and later rows that the deep cuts made redundant never cost anything. The cut is differentiable in the rows
-and in the polygon it started from. Whatever round-off leaves open stays in: the result is an outer set.
+The rows that some vertex exceeds by more than round-off cut the polygon one after the other, the deepest first, so that
+most of the others have become redundant when their turn comes; only polygons that are really cut are touched. The cut
+is differentiable in the rows and in the polygon it started from. Whatever round-off leaves open stays in: the result is
+an outer set.
 
 Where no gradient is needed, `polygon_kernel` does the same in compiled code.
 """
@@ -90,51 +91,44 @@ def clip(
     outcome = torch.full((len(A),), Outcome.NONEMPTY, device=A.device)
     shrunk = torch.zeros(len(A), dtype=torch.bool, device=A.device)
     against = Contradiction.none(len(A), A)
-    items = _touched(polygon, A, b).nonzero().squeeze(-1)
-    if len(items) == 0:
+    cuts = _Cuts.of(polygon, A, b)
+    if len(cuts.item) == 0:
         return Clipped(polygon, outcome, shrunk, against)
 
+    items = cuts.item
     before = polygon.select(items)
     table = _Table.of(before, A[items], b[items], time[items], source[items])
-    rings, finished = _Rings.start(before, A[items], b[items]), []
-    while len(rings.item) > 0:
-        with torch.no_grad():
-            beyond = excess(rings.A, rings.b, rings.vertices).amax(-1)
-            cutting = rings.cutting & (beyond > rings.tolerance)
-            row = torch.where(cutting, beyond / lengths(rings.A), -torch.inf).argmax(-1, keepdim=True)
-            going = cutting.any(-1)
-        if not bool(going.all()):
-            finished.append(rings.select(~going))
-            rings, cutting, row = rings.select(going), cutting[going], row[going]
-            if len(rings.item) == 0:
-                break
-        over = excess(take(rings.A, row), rings.b.gather(1, row), rings.vertices).squeeze(1)
-        tolerance, edge = rings.tolerance.gather(1, row), rings.row.gather(1, row)
+    rings, finished = _Rings.of(before), []
+    verdict, changed = outcome[items], shrunk[items]
+    for r in range(cuts.b.shape[1]):
+        live = int((cuts.number > r).sum())  # the first ones: they come in the order of how many rows they have
+        finished.append(rings.part(slice(live, None)))
+        rings, a, c = rings.part(slice(live)), cuts.A[:live, r], cuts.b[:live, r].unsqueeze(-1)
+        tolerance, edge = cuts.tolerance[:live, r].unsqueeze(-1), cuts.edge[:live, r].unsqueeze(-1)
+        over = rings.vertices[..., 0] * a[:, :1] + rings.vertices[..., 1] * a[:, 1:] - c
         kept, surely = over <= tolerance, (over < -tolerance).any(-1)
-        empty = ~kept.any(-1)
-        verdict = torch.where(empty, Outcome.EMPTY, torch.where(surely, rings.outcome, Outcome.UNDECIDED))
-        cutting = cutting.scatter(1, row, False) & ~empty.unsqueeze(-1)
-        rings = rings._replace(cutting=cutting, outcome=verdict)
-        # Another order of the same sums may have found a vertex beyond the line that this one finds on it.
-        cut = surely & ~kept.all(-1)
-
+        beyond = ~kept.all(-1) & (verdict[:live] != Outcome.EMPTY)
+        empty, cut = beyond & ~kept.any(-1), beyond & surely
+        verdict[:live] = torch.where(empty, Outcome.EMPTY, verdict[:live])
+        verdict[:live] = torch.where(beyond & ~empty & ~surely, Outcome.UNDECIDED, verdict[:live])
+        changed[:live] |= cut
         if bool(empty.any()):
             count, closest = rings.count[empty, None], over[empty].argmin(-1, keepdim=True)
             met = rings.edge[empty].gather(1, torch.cat([(closest - 1) % count, closest % count], dim=-1))
-            table.select(rings.item[empty]).report(
-                torch.cat([edge[empty], met], dim=-1), items[rings.item[empty]], against
-            )
+            lost = empty.nonzero().squeeze(-1)
+            table.select(lost).report(torch.cat([edge[lost], met], dim=-1), items[lost], against)
         if bool(cut.all()):
             rings = _cut(rings, over, tolerance, edge, table.padding)
         elif bool(cut.any()):
-            smaller = _cut(rings.select(cut), over[cut], tolerance[cut], edge[cut], table.padding)
-            rings = _Rings.join([smaller, rings.select(~cut)], table.padding)
+            some = cut.nonzero().squeeze(-1)
+            smaller = _cut(rings.part(some), over[some], tolerance[some], edge[some], table.padding)
+            rings = rings.replaced(some, smaller, table.padding)
 
-    rings = _Rings.join(finished, table.padding)
-    outcome[items[rings.item]] = rings.outcome
-    rings = rings.select(rings.shrunk & (rings.outcome != Outcome.EMPTY))
-    smaller = table.select(rings.item).polygon(rings, before.reach[rings.item])
-    where, keep = items[rings.item], torch.ones_like(rings.shrunk)
+    rings = _Rings.join([rings, *reversed(finished)], table.padding)
+    outcome[items] = verdict
+    kept = (changed & (verdict != Outcome.EMPTY)).nonzero().squeeze(-1)
+    smaller = table.select(kept).polygon(rings.part(kept), before.reach[kept])
+    where, keep = items[kept], torch.ones_like(kept, dtype=torch.bool)
     if most is not None and bool((over_full := smaller.count > most).any()):
         merged = merge(smaller.select(over_full), most)
         # The areas are sums in some order.
@@ -175,55 +169,73 @@ def merge(polygon: Polygon, most: int) -> Polygon:
         polygon = polygon.replaced(over[possible], smaller)
 
 
-class _Rings(NamedTuple):
-    """Rings being cut: the vertices, for each vertex the number of the edge that it starts, and the rows to cut by.
+class _Cuts(NamedTuple):
+    """The rows that cut, of polygons that are cut: those that most rows cut first, of each the deepest row first.
 
     Attributes:
-        item: which polygon. row: the numbers of the edges that the rows will make. cutting: rows that may still cut.
+        item: which polygon. number: how many rows cut it; the others behind them do not.
+        edge: the number of the edge that a row will make: old edges are numbered by their slots, new ones behind them.
     """
 
     item: Int[Tensor, "k"]
+    number: Int[Tensor, "k"]
+    A: Float[Tensor, "k R 2"]
+    b: Float[Tensor, "k R"]
+    tolerance: Float[Tensor, "k R"]
+    edge: Int[Tensor, "k R"]
+
+    @classmethod
+    def of(cls, polygon: Polygon, A: Float[Tensor, "B R 2"], b: Float[Tensor, "B R"]) -> _Cuts:
+        with torch.no_grad():
+            # Bounding boxes rule most polygons out.
+            lower, upper = polygon.vertices.amin(1).unsqueeze(1), polygon.vertices.amax(1).unsqueeze(1)
+            boxed = excess(A.clamp(min=0), b, upper) + A.clamp(max=0) @ lower.mT
+            item = (boxed > 0).flatten(1).any(-1).nonzero().squeeze(-1)
+            rows, bounds, part = A[item], b[item], polygon.select(item)
+            tolerance = round_off(rows, bounds, part.reach)
+            beyond = excess(rows, bounds, part.trimmed()).amax(-1)
+            cutting = beyond > tolerance
+            number, order = cutting.sum(-1).sort(descending=True)
+            order = order[: int((number > 0).sum())]
+            number, item = number[: len(order)], item[order]
+            depth = torch.where(cutting, beyond / lengths(rows), -torch.inf)[order]
+            first = depth.argsort(dim=-1, descending=True)[:, : int(number.max()) if len(order) else 0]
+        return cls(
+            item=item,
+            number=number,
+            A=take(A[item], first),
+            b=b[item].gather(1, first),
+            tolerance=tolerance[order].gather(1, first),
+            edge=polygon.slots + first,
+        )
+
+
+class _Rings(NamedTuple):
+    """Rings being cut: the vertices, and for each vertex the number of the edge that it starts."""
+
     vertices: Float[Tensor, "k V 2"]
     edge: Int[Tensor, "k V"]
     count: Int[Tensor, "k"]
-    A: Float[Tensor, "k R 2"]
-    b: Float[Tensor, "k R"]
-    row: Int[Tensor, "k R"]
-    tolerance: Float[Tensor, "k R"]
-    cutting: Bool[Tensor, "k R"]
-    outcome: Int[Tensor, "k"]
-    shrunk: Bool[Tensor, "k"]
 
     @classmethod
-    def start(cls, polygon: Polygon, A: Tensor, b: Tensor) -> _Rings:
-        """The rings as they are, with the rows that cut any; old edges are numbered by their slots, new ones behind."""
-        tolerance = round_off(A, b, polygon.reach)
-        with torch.no_grad():
-            cutting = excess(A, b, polygon.vertices).amax(-1) > tolerance
-            first = cutting.byte().argsort(dim=-1, descending=True, stable=True)[:, : int(cutting.sum(-1).max())]
-        return cls(
-            item=torch.arange(len(b), device=b.device),
-            vertices=polygon.vertices,
-            edge=torch.arange(polygon.slots, device=b.device).expand(len(b), -1),
-            count=polygon.count,
-            A=take(A, first),
-            b=b.gather(1, first),
-            row=polygon.slots + first,
-            tolerance=tolerance.gather(1, first),
-            cutting=cutting.gather(1, first),
-            outcome=torch.full_like(polygon.count, Outcome.NONEMPTY),
-            shrunk=torch.zeros_like(polygon.count, dtype=torch.bool),
-        )
+    def of(cls, polygon: Polygon) -> _Rings:
+        vertices = polygon.trimmed()
+        slots = torch.arange(vertices.shape[1], device=vertices.device)
+        return cls(vertices, slots.expand(vertices.shape[:2]), polygon.count)
 
-    def select(self, items: Tensor) -> _Rings:
+    def part(self, items: Tensor | slice) -> _Rings:
         return _Rings(*(field[items] for field in self))
+
+    def replaced(self, items: Tensor, other: _Rings, padding: int) -> _Rings:
+        slots = max(self.vertices.shape[1], other.vertices.shape[1])
+        mine, theirs = self._widened(slots, padding), other._widened(slots, padding)
+        return _Rings(*(field.index_put((items,), new) for field, new in zip(mine, theirs, strict=True)))
 
     @classmethod
     def join(cls, parts: Sequence[_Rings], padding: int) -> _Rings:
         slots = max(part.vertices.shape[1] for part in parts)
-        return cls(
-            *(torch.cat(fields) for fields in zip(*(part._widened(slots, padding) for part in parts), strict=True))
-        )
+        wide = (part._widened(slots, padding) for part in parts)
+        return cls(*(torch.cat(fields) for fields in zip(*wide, strict=True)))
 
     def _widened(self, slots: int, padding: int) -> _Rings:
         extra = slots - self.vertices.shape[1]
@@ -269,19 +281,6 @@ class _Table(NamedTuple):
             known[items] = column.gather(1, edges).detach()
 
 
-@torch.no_grad()
-def _touched(polygon: Polygon, A: Float[Tensor, "B R 2"], b: Float[Tensor, "B R"]) -> Bool[Tensor, "B"]:
-    """Polygons with a vertex beyond some row, by more than round-off; bounding boxes rule most others out first."""
-    lower, upper = polygon.vertices.amin(1), polygon.vertices.amax(1)
-    beyond = excess(A.clamp(min=0), b, upper.unsqueeze(1)) + A.clamp(max=0) @ lower.unsqueeze(-1)
-    touched = (beyond > 0).flatten(1).any(-1)
-    items = touched.nonzero().squeeze(-1)
-    if len(items) > 0:
-        A, b, part = A[items], b[items], polygon.select(items)
-        touched[items] = (excess(A, b, part.vertices).amax(-1) > round_off(A, b, part.reach)).any(-1)
-    return touched
-
-
 def _cut(rings: _Rings, over: Tensor, tolerance: Tensor, new: Tensor, padding: int) -> _Rings:
     """The part of each ring on the inner side of a line that really cuts it: `over` is a.v - c at its vertices.
 
@@ -309,8 +308,7 @@ def _cut(rings: _Rings, over: Tensor, tolerance: Tensor, new: Tensor, padding: i
     vertices = torch.where(back.unsqueeze(-1), _crossing(rings.vertices, over, first, before), vertices)
     edge = rings.edge.gather(1, torch.where(slot < length, position, before))
     edge = torch.where(slot == length - 1 + leaves, new, edge).masked_fill(slot >= total, padding)
-    shrunk = torch.ones_like(rings.shrunk)
-    return rings._replace(vertices=vertices, edge=edge, count=total.squeeze(-1), shrunk=shrunk)
+    return _Rings(vertices, edge, total.squeeze(-1))
 
 
 def _crossing(vertices: Tensor, over: Tensor, inner: Tensor, outer: Tensor) -> Float[Tensor, "k 1 2"]:

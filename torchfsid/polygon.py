@@ -66,6 +66,10 @@ class Polygon:
         """Slots that hold a vertex (and its edge)."""
         return torch.arange(self.slots, device=self.count.device) < self.count.unsqueeze(-1)
 
+    def trimmed(self) -> Float[Tensor, "B W 2"]:
+        """The vertices, without the slots that no polygon of the batch needs."""
+        return self.vertices[:, : int(self.count.max())] if len(self.count) > 0 else self.vertices
+
     def select(self, items: Tensor) -> Polygon:
         """The sub-batch at `items` (indices or a mask)."""
         return Polygon(*(field[items] for field in self.fields()))

@@ -1,6 +1,6 @@
 r"""Polygons in scalar code: what `clipping` and `polygon` do in torch, one polygon after the other, compiled by numba.
 
-Of the rows that some vertex exceeds by more than round-off, the one that cuts deepest cuts next:
+Of the rows that some vertex exceeds by more than round-off, the one that cut deepest at first cuts next:
 
     kept vertices  a.v - c <= tolerance: one arc of the ring, closed where the ring crosses the line
     none kept      EMPTY: the row contradicts the two edges that meet at the vertex nearest to it
@@ -39,18 +39,18 @@ def _box(vertices, k, n):
 
 @ordered
 @no_type_check
-def _beyond(vertices, n, p, q, c):
+def _beyond(vertices, k, n, p, q, c):
     """How far the vertices reach beyond the line (p, q).z = c."""
     most = -np.inf
     for i in range(n):
-        beyond = p * vertices[i, 0] + q * vertices[i, 1] - c
+        beyond = p * vertices[k, i, 0] + q * vertices[k, i, 1] - c
         most = beyond if beyond > most else most
     return most
 
 
 @compiled
 @no_type_check
-def _any_cuts(vertices, k, n, reach, A, b, tolerance, beyond, cutting, epsilon):
+def _any_cuts(vertices, k, n, reach, A, b, tolerance, depth, cutting, epsilon):
     """Mark the rows that some vertex exceeds by more than round-off; the bounding box spares many of them the loop."""
     x0, x1, y0, y1 = _box(vertices, k, n)
     found = False
@@ -59,38 +59,35 @@ def _any_cuts(vertices, k, n, reach, A, b, tolerance, beyond, cutting, epsilon):
         cutting[r] = False
         if p * (x1 if p > 0 else x0) + q * (y1 if q > 0 else y0) - c > 0:
             tolerance[r] = epsilon * (abs(p) * reach[k, 0] + abs(q) * reach[k, 1] + abs(c))
-            beyond[r] = _beyond(vertices[k], n, p, q, c)
-            cutting[r] = beyond[r] > tolerance[r]
+            beyond = _beyond(vertices, k, n, p, q, c)
+            cutting[r], depth[r] = beyond > tolerance[r], beyond / math.sqrt(p * p + q * q)
             found = found or cutting[r]
     return found
 
 
 @compiled
 @no_type_check
-def _clip_ring(k, ring, edge, n, A, b, tolerance, beyond, cutting, first_row, over, spare, spare_edge):
-    """Cut the ring of n vertices by the rows marked `cutting`, deepest first; row r makes the edge first_row + r.
+def _clip_ring(k, ring, edge, n, A, b, tolerance, depth, cutting, first_row, over, spare, spare_edge):
+    """Cut the ring of n vertices by the rows marked `cutting`, by their `depth`; row r makes the edge first_row + r.
 
     Returns (n, outcome, shrunk, and for EMPTY the row and the edges that contradict each other).
     """
     outcome, shrunk = NONEMPTY, False
     while True:
-        row, deepest = -1, 0.0
+        row = -1
         for r in range(b.shape[1]):
-            if cutting[r]:
-                if shrunk:
-                    beyond[r] = _beyond(ring, n, A[k, r, 0], A[k, r, 1], b[k, r])
-                cutting[r] = beyond[r] > tolerance[r]
-                depth = beyond[r] / math.sqrt(A[k, r, 0] ** 2 + A[k, r, 1] ** 2)
-                if cutting[r] and depth > deepest:
-                    row, deepest = r, depth
+            if cutting[r] and (row < 0 or depth[r] > depth[row]):
+                row = r
         if row < 0:
             return n, outcome, shrunk, -1, -1, -1
         cutting[row] = False
-        slack, inner = tolerance[row], 0
+        slack, inner, outer = tolerance[row], 0, 0
         for i in range(n):
             over[i] = A[k, row, 0] * ring[i, 0] + A[k, row, 1] * ring[i, 1] - b[k, row]
-            if over[i] < over[inner]:
-                inner = i
+            inner = i if over[i] < over[inner] else inner
+            outer = i if over[i] > over[outer] else outer
+        if over[outer] <= slack:  # an earlier cut has made it redundant
+            continue
         if over[inner] > slack:
             return n, EMPTY, False, row, edge[_before(inner, n)], edge[inner]
         if over[inner] >= -slack:
@@ -232,7 +229,7 @@ def clip(polygons, A, b, stamp, source, most, epsilon, parallel):
     vertices, ring_A, ring_b, time, ring_source, count, reach = polygons
     (B, R), V = b.shape, ring_b.shape[1]
     W = V + R + 1
-    tolerance, beyond, cutting, over = np.empty(R), np.empty(R), np.empty(R, np.bool_), np.empty(W)
+    tolerance, depth, cutting, over = np.empty(R), np.empty(R), np.empty(R, np.bool_), np.empty(W)
     ring, spare, lines = np.empty((W, 2)), np.empty((W, 2)), np.empty((W, 2))
     edge, spare_edge = np.empty(W, np.int64), np.empty(W, np.int64)
     result, slots = polygons, 0
@@ -242,12 +239,12 @@ def clip(polygons, A, b, stamp, source, most, epsilon, parallel):
     lost_time, lost_source = np.full((B, 3), np.nan), np.full((B, 3), -1)
     for k in range(B):
         n = count[k]
-        if not _any_cuts(vertices, k, n, reach, A, b, tolerance, beyond, cutting, epsilon):
+        if not _any_cuts(vertices, k, n, reach, A, b, tolerance, depth, cutting, epsilon):
             continue
         for i in range(n):
             ring[i, 0], ring[i, 1], edge[i] = vertices[k, i, 0], vertices[k, i, 1], i
         n, outcome[k], shrunk[k], row, before, after = _clip_ring(
-            k, ring, edge, n, A, b, tolerance, beyond, cutting, V, over, spare, spare_edge
+            k, ring, edge, n, A, b, tolerance, depth, cutting, V, over, spare, spare_edge
         )
         if outcome[k] == EMPTY:
             for i, e in enumerate((V + row, before, after)):
