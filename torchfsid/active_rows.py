@@ -28,6 +28,9 @@ from torchfsid.halfspaces import ROUND_OFF
 PARALLEL = 1e-12
 """Angle [rad] below which rows count as parallel."""
 
+MOST_ROUNDS = 50
+"""Rounds per row and dimension after which a search gives up. A few rounds per dimension are usual."""
+
 TIE = 1e-12
 """Multipliers that differ by less than this are equal: the ball is then free to roll, and the tie rule decides."""
 
@@ -51,7 +54,7 @@ class NearestRows(NamedTuple):
         rows: (B, p), the active rows in the first `count` places.
         count: (B,).
         multipliers: (B, p), -point = sum_s multipliers_s a_s, all >= 0; 0 behind the first `count`.
-        empty: (B,), no point satisfies the rows.
+        empty: (B,), no point satisfies the rows (or the search gave up, which has not been seen).
     """
 
     point: Reals
@@ -81,7 +84,7 @@ def nearest_rows(A: Reals, b: Reals, parallel: float = PARALLEL) -> NearestRows:
 
     Feasible sets whose corners are sharper than `parallel` [rad] may be called empty.
     """
-    B, _, p = A.shape
+    B, m, p = A.shape
     found = NearestRows(
         point=np.zeros((B, p)),
         rows=np.zeros((B, p), dtype=np.int64),
@@ -93,7 +96,7 @@ def nearest_rows(A: Reals, b: Reals, parallel: float = PARALLEL) -> NearestRows:
     if installed():
         from torchfsid import active_rows_kernel as kernel
 
-        kernel.nearest_rows(np.ascontiguousarray(A), b, parallel, ROUND_OFF, *found)
+        kernel.nearest_rows(np.ascontiguousarray(A), b, parallel, ROUND_OFF, MOST_ROUNDS * (m + p), *found)
         return found
     items = np.flatnonzero((b < 0).any(-1))
     A, b = A[items], b[items]
@@ -101,11 +104,15 @@ def nearest_rows(A: Reals, b: Reals, parallel: float = PARALLEL) -> NearestRows:
     # Per item: the active rows, how many, the row that is being pushed (-1: none), its multiplier so far.
     rows, count = np.zeros((len(items), p), dtype=np.int64), np.zeros(len(items), dtype=np.int64)
     entering, push = np.full(len(items), -1), np.zeros(len(items))
-    while len(items) > 0:
+    for _ in range(MOST_ROUNDS * (m + p)):
+        if len(items) == 0:
+            return found
         filled = slots < count[:, None]
         N, right = A[at[:, None], rows], np.where(filled, b[at[:, None], rows], 0.0)
-        V = inverse(completed(N, filled))
+        W = completed(N, filled)
+        V = inverse(W)
         z = times(V, right)
+        z = z + times(V, right - times(W, z))  # the rows of a sharp corner hold to round-off then
         fresh = entering < 0
         q = np.where(fresh, (times(A, z) - b).argmax(-1), entering)
         n, bound = A[at, q], b[at, q]
@@ -148,12 +155,13 @@ def nearest_rows(A: Reals, b: Reals, parallel: float = PARALLEL) -> NearestRows:
             on = ~stopped
             items, at = items[on], at[: on.sum()]
             A, b, rows, count, entering, push = (array[on] for array in (A, b, rows, count, entering, push))
+    found.empty[items] = True
     return found
 
 
 def inscribed_rows(A: Reals, b: Reals) -> InscribedRows:
     """The largest ball in each {z : A z <= b}; unit rows A (B, m, p), or zero rows, which are ignored."""
-    B, _, p = A.shape
+    B, m, p = A.shape
     found = InscribedRows(
         ball=np.zeros((B, p + 1)),
         rows=np.zeros((B, p + 1), dtype=np.int64),
@@ -165,13 +173,17 @@ def inscribed_rows(A: Reals, b: Reals) -> InscribedRows:
     if installed():
         from torchfsid import active_rows_kernel as kernel
 
-        kernel.inscribed_rows(np.ascontiguousarray(A), b, simplex_around(p), TIE, ROUND_OFF, *found)
+        most = MOST_ROUNDS * (m + p)
+        kernel.inscribed_rows(np.ascontiguousarray(A), b, simplex_around(p), TIE, ROUND_OFF, most, *found)
         return found
     items, at = np.arange(B), np.arange(B)
     basis, M, right, far = _first_basis(A, b)
-    while len(items) > 0:
+    for _ in range(MOST_ROUNDS * (m + p)):
+        if len(items) == 0:
+            break
         V = inverse(M)
         w = times(V, right)
+        w = w + times(V, right - times(M, w))
         price = times(A, w[:, :p]) + w[:, p:] - b
         is_open = far.any()
         if is_open:  # infinitely violated rows come first, infinitely slack ones never
@@ -191,7 +203,7 @@ def inscribed_rows(A: Reals, b: Reals) -> InscribedRows:
             done = worst <= ROUND_OFF * noise
         if done.any():
             stopped = items[done]
-            found.ball[stopped], found.rows[stopped] = (w + times(V, right - times(M, w)))[done], basis[done]
+            found.ball[stopped], found.rows[stopped] = w[done], basis[done]
             if is_open:
                 found.open_centre[stopped] = (np.abs(w_far[done, :p]) > TIE).any(-1)
                 found.open_radius[stopped] = w_far[done, p] > TIE

@@ -77,14 +77,15 @@ def _most_violated(A, b, z, rise):
 
 @compiled
 @no_type_check
-def nearest_rows(A, b, parallel, epsilon, point, rows, count, multipliers, empty):
+def nearest_rows(A, b, parallel, epsilon, most_rounds, point, rows, count, multipliers, empty):
     """Into the last five; b infinite for rows to ignore."""
     B, _, p = A.shape
     Q, R = np.zeros((p, p)), np.zeros((p, p))
     y, c, e, held, d, z = np.zeros(p), np.zeros(p), np.zeros(p), np.zeros(p), np.zeros(p), np.zeros(p)
     for item in range(B):
         own, k, q, push = rows[item], 0, -1, 0.0
-        while True:
+        empty[item] = True
+        for _ in range(most_rounds):
             _orthonormal(A[item], own, k, Q, R)
             z[:] = 0.0
             for i in range(k):
@@ -98,6 +99,7 @@ def nearest_rows(A, b, parallel, epsilon, point, rows, count, multipliers, empty
             if fresh:
                 q, worst = _most_violated(A[item], b[item], z, 0.0)
                 if q < 0 or (k == 0 and worst <= 0.0):
+                    empty[item] = False
                     break
             n, bound = A[item, q], b[item, q]
             for j in range(p):
@@ -119,6 +121,7 @@ def nearest_rows(A, b, parallel, epsilon, point, rows, count, multipliers, empty
                 coordinates += abs(c[i])
             noise += coordinates * push * slope + size + abs(bound)
             if fresh and over <= epsilon * noise:
+                empty[item] = False
                 break
             apart = slope > (parallel + epsilon * coordinates) ** 2
             full = max(over, 0.0) / slope if apart else np.inf
@@ -135,7 +138,6 @@ def nearest_rows(A, b, parallel, epsilon, point, rows, count, multipliers, empty
                 k += 1
                 q, push = -1, 0.0
             else:
-                empty[item] = True
                 break
         if not empty[item]:
             count[item] = k
@@ -203,7 +205,7 @@ def _invert(M, V):
 
 @compiled
 @no_type_check
-def inscribed_rows(A, b, simplex, tie, epsilon, ball, rows, open_centre, open_radius):
+def inscribed_rows(A, b, simplex, tie, epsilon, most_rounds, ball, rows, open_centre, open_radius):
     """Into the last four; b infinite for rows to ignore."""
     B, m, p = A.shape
     M, V = np.zeros((p + 1, p + 1)), np.zeros((p + 1, p + 1))
@@ -213,7 +215,7 @@ def inscribed_rows(A, b, simplex, tie, epsilon, ball, rows, open_centre, open_ra
         basis = rows[item]
         for s in range(p + 1):
             basis[s] = m + s
-        while True:
+        for _ in range(most_rounds):
             is_open = False
             for s in range(p + 1):
                 row = A[item, basis[s]] if basis[s] < m else simplex[basis[s] - m]
