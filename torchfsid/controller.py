@@ -3,9 +3,8 @@ r"""What a robot does: the safety QP, and the control as a differentiable functi
     u* = argmin |u - uhat|^2  s.t.  A u <= b,      uhat = C theta + d                       (G., Eq. (5))
     uhat - u* = 1/2 sum_j mu_j a_j,   mu_j >= 0,   mu_j (a_j.u* - b_j) = 0                  (G., Eqs. (7)-(10))
 
-daqp finds the rows with positive multipliers, without gradients. The control is then recomputed from these rows alone,
-u* = (I - P) uhat + A_a^+ b_a: the same number to round-off, and differentiable in theta, positions, gains and distances
-wherever the active set does not switch; at a switch the derivative is that of one side.
+It is the point of the safe controls nearest to uhat (`programmes`): exact, and differentiable in theta, positions,
+gains and distances wherever the active set does not switch; at a switch the derivative is that of one side.
 """
 
 from __future__ import annotations
@@ -14,26 +13,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import daqp
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchfsid.barriers import Barrier, is_joint
-from torchfsid.errors import InputError, SolverError
+from torchfsid.errors import InputError
+from torchfsid.exact import Status
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.kkt import solve_kkt
+from torchfsid.kkt import RANK_TOLERANCE
 from torchfsid.measurement import Measurement
+from torchfsid.programmes import broadcast, nearest
 from torchfsid.tasks import Task
 
-OPTIMAL, INFEASIBLE = 1, -1
-"""Exit flags of daqp; all others are failures of the solver."""
-
-DAQP_TOLERANCES = {"primal_tol": 1e-12, "zero_tol": 1e-14, "sing_tol": 1e-14}
-"""Relative to the speeds of the problem. `sing_tol` is the square of the angle [rad] below which daqp takes rows for
-parallel: its default calls every wedge thinner than 6e-6 rad infeasible. This one is 1e-7 rad, like
-`kkt.RANK_TOLERANCE`, so that the rows daqp tells apart are apart for `solve_kkt` too."""
+PARALLEL = 2 * RANK_TOLERANCE
+"""Angle [rad] below which rows count as parallel, so that active rows are apart for `solve_kkt` too."""
 
 
 class QpSolution(NamedTuple):
@@ -52,59 +46,24 @@ class QpSolution(NamedTuple):
     feasible: Bool[Tensor, "*batch"]
 
 
-@torch.no_grad()
 def solve_safe_qp(safe_controls: Halfspaces, uhat: Float[Tensor, "*batch n"]) -> QpSolution:
-    """The control closest to `uhat` among the safe ones, by daqp, without gradients. Batches broadcast.
+    """The control closest to `uhat` among the safe ones, with gradients. Batches broadcast.
 
     An item whose rows or nominal control are not finite (two bodies at one place, say) counts as infeasible.
 
     Raises:
         InputError: `uhat` has another dimension than the rows.
-        SolverError: daqp ended in any other way than optimal or infeasible.
     """
     m, n = safe_controls.rows, safe_controls.dim
     if uhat.shape[-1:] != (n,):
         raise InputError("uhat", f"(*batch, {n})", tuple(uhat.shape))
-    batch = torch.broadcast_shapes(safe_controls.batch_shape, uhat.shape[:-1])
-    unit = safe_controls.normalised()
-    A = _items(unit.A, batch, (m, n))
-    b = _items(unit.b, batch, (m,))
-    norms = _items(safe_controls.norms(), batch, (m,))
-    nominal = _items(uhat, batch, (n,))
-
-    is_row = (A != 0).any(-1)
-    finite = np.isfinite(A).all((-1, -2)) & np.isfinite(b).all(-1) & np.isfinite(nominal).all(-1)
-    feasible = finite & ~(~is_row & (b < 0)).any(-1)
-    with np.errstate(invalid="ignore"):
-        violation = ((A @ nominal[..., None])[..., 0] - b).max(-1, initial=0.0)
-
-    u = np.where(feasible[:, None], nominal, 0.0)
-    multipliers = np.zeros_like(b)
-    for item in np.flatnonzero(feasible & (violation > 0)):
-        rows = is_row[item]
-        # In units of the speeds at hand, so that daqp's absolute tolerances are relative ones.
-        speed = max(np.abs(nominal[item]).max(), violation[item])
-        solution, _, flag, info = daqp.solve(
-            np.eye(n), -nominal[item] / speed, A[item][rows], b[item][rows] / speed, **DAQP_TOLERANCES
-        )
-        if flag not in (OPTIMAL, INFEASIBLE):
-            raise SolverError(f"daqp stopped with exit flag {flag}, neither optimal nor infeasible, at item {item}")
-        feasible[item] = flag == OPTIMAL
-        u[item] = solution * speed if flag == OPTIMAL else 0.0
-        if flag == OPTIMAL:
-            multipliers[item, rows] = 2 * speed * info["lam"].clip(min=0) / norms[item, rows]
-
-    def shaped(items: np.ndarray) -> Tensor:
-        return torch.from_numpy(items).to(uhat.device).reshape((*batch, *items.shape[1:]))
-
-    mu = shaped(multipliers)
-    return QpSolution(shaped(u), mu > 0, mu, shaped(feasible))
-
-
-def _items(values: Tensor, batch: torch.Size, shape: tuple[int, ...]) -> np.ndarray:
-    """One item per leading index, for the loop over a batch."""
-    values = values.to("cpu", torch.float64).expand(*batch, *shape)
-    return values.reshape(batch.numel(), *shape).numpy()
+    rows, y, _ = broadcast(safe_controls, uhat)
+    nearest_control, mu, places, filled, status = nearest(rows, y, parallel=PARALLEL)
+    feasible = status == Status.OK
+    u = torch.where(feasible.unsqueeze(-1), nearest_control, 0.0)
+    held = torch.where(filled, 2 * mu.clamp(min=0), 0.0)
+    multipliers = torch.zeros_like(rows.b).scatter_add(-1, places, held)[..., :m]
+    return QpSolution(u, multipliers > 0, multipliers, feasible)
 
 
 @dataclass(frozen=True)
@@ -149,7 +108,6 @@ class CbfQpController:
 
         Raises:
             InputError: `theta` does not fit the task, or is not finite.
-            SolverError: see `solve_safe_qp`.
         """
         C, d = self.task(measurement)
         if theta.shape[-1:] != C.shape[-1:]:
@@ -195,14 +153,5 @@ class CbfQpController:
 
 
 def _control(safe_controls: Halfspaces, uhat: Tensor) -> Control:
-    """daqp decides which rows are active, and the KKT conditions at these rows give the control."""
-    batch = torch.broadcast_shapes(safe_controls.batch_shape, uhat.shape[:-1])
-    uhat = uhat.expand(*batch, uhat.shape[-1])
-    rows = Halfspaces(
-        safe_controls.A.expand(*batch, *safe_controls.A.shape[-2:]),
-        safe_controls.b.expand(*batch, safe_controls.rows),
-    )
-    _, active, _, feasible = solve_safe_qp(rows, uhat)
-    # With no parameter, p = 0, and d = uhat, the offset f is the control itself.
-    u = solve_kkt(rows, active, uhat.new_zeros(*uhat.shape, 0), uhat).f
-    return Control(torch.where(feasible.unsqueeze(-1), u, 0.0), uhat, active, feasible)
+    u, active, _, feasible = solve_safe_qp(safe_controls, uhat)
+    return Control(u, uhat.expand(u.shape), active, feasible)

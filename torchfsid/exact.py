@@ -10,7 +10,7 @@ from enum import IntEnum
 import numpy as np
 
 from torchfsid import active_rows
-from torchfsid.active_rows import Mask, Reals, inscribed_rows, nearest_rows, times
+from torchfsid.active_rows import PARALLEL, Mask, Reals, inscribed_rows, nearest_rows, times
 from torchfsid.halfspaces import ROUND_OFF
 
 
@@ -29,7 +29,7 @@ class Status(IntEnum):
     """A row or the point is NaN or infinite, or the metric is not positive definite."""
 
 
-def nearest_point(A: Reals, b: Reals, y: Reals, metric: Reals | None = None) -> tuple:
+def nearest_point(A: Reals, b: Reals, y: Reals, metric: Reals | None = None, parallel: float = PARALLEL) -> tuple:
     """Point, multipliers, active rows, the places they fill, status."""
     finite = np.isfinite(A.sum((1, 2)) + b.sum(-1) + y.sum(-1))
     rows = A
@@ -38,7 +38,7 @@ def nearest_point(A: Reals, b: Reals, y: Reals, metric: Reals | None = None) -> 
         finite &= definite & np.isfinite(metric.sum((1, 2)))
         rows = _whitened(A, root)
     unit, offsets, impossible = _unit(rows, b - times(A, y), finite)
-    found = nearest_rows(unit, offsets)
+    found = nearest_rows(unit, offsets, parallel)
     ok = finite & ~found.empty & ~impossible
     filled = ok[:, None] & (np.arange(A.shape[-1]) < found.count[:, None])
     z = found.point if metric is None else np.linalg.solve(root.swapaxes(-1, -2), found.point[..., None])[..., 0]

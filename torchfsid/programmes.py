@@ -15,6 +15,7 @@ whose condition is that of the rows squared, is never formed.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from inspect import signature
 from typing import Any, NamedTuple
 
@@ -24,7 +25,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchfsid import exact
-from torchfsid.active_rows import simplex_around
+from torchfsid.active_rows import PARALLEL, simplex_around
 from torchfsid.errors import InputError
 from torchfsid.exact import Status
 from torchfsid.halfspaces import Halfspaces
@@ -57,10 +58,12 @@ def nearest_point(
     return NearestPoint(found.to(point.dtype), status)
 
 
-def nearest(halfspaces: Halfspaces, y: Tensor, metric: Tensor | None = None) -> tuple[Tensor, ...]:
+def nearest(
+    halfspaces: Halfspaces, y: Tensor, metric: Tensor | None = None, parallel: float = PARALLEL
+) -> tuple[Tensor, ...]:
     """The point, the multipliers mu, the active rows, which of their places are filled, and the status, for `broadcast`
-    arguments. The two first have gradients."""
-    return _NearestPoint.apply(halfspaces.A, halfspaces.b, y, metric)  # type: ignore[return-value]
+    arguments. The two first have gradients. Rows less than `parallel` [rad] apart may count as parallel."""
+    return _NearestPoint.apply(halfspaces.A, halfspaces.b, y, metric, parallel)  # type: ignore[return-value]
 
 
 def inscribed_ball(halfspaces: Halfspaces) -> InscribedBall:
@@ -114,12 +117,13 @@ class _NearestPoint(torch.autograd.Function):
 
     @staticmethod
     @_signed
-    def forward(A: Tensor, b: Tensor, y: Tensor, metric: Tensor | None) -> tuple[Tensor, ...]:
-        return on_arrays(exact.nearest_point, *((A, b, y) if metric is None else (A, b, y, metric)))
+    def forward(A: Tensor, b: Tensor, y: Tensor, metric: Tensor | None, parallel: float) -> tuple[Tensor, ...]:
+        search = partial(exact.nearest_point, parallel=parallel)
+        return on_arrays(search, *((A, b, y) if metric is None else (A, b, y, metric)))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
-        A, _, y, metric = inputs
+        A, _, y, metric, _ = inputs
         ctx.mark_non_differentiable(*output[2:])
         ctx.save_for_backward(A, y, metric, *output)
         ctx.save_for_forward(A, y, metric, *output)
@@ -134,11 +138,11 @@ class _NearestPoint(torch.autograd.Function):
         of_A = torch.zeros_like(A).scatter_add(-2, index, _of_rows(mu, u, v, z))
         of_b = torch.zeros_like(A[..., 0]).scatter_add(-1, rows, v)
         if metric is None:
-            return of_A, of_b, u, None
-        return of_A, of_b, times(metric, u), u.unsqueeze(-1) * torch.where(ok, y - z, 0.0).unsqueeze(-2)
+            return of_A, of_b, u, None, None
+        return of_A, of_b, times(metric, u), u.unsqueeze(-1) * torch.where(ok, y - z, 0.0).unsqueeze(-2), None
 
     @staticmethod
-    def jvp(ctx: Any, dA: Any, db: Any, dy: Any, dmetric: Any) -> tuple[Tensor | None, ...]:
+    def jvp(ctx: Any, dA: Any, db: Any, dy: Any, dmetric: Any, _: None) -> tuple[Tensor | None, ...]:
         A, y, metric, z, mu, rows, filled, status = ctx.saved_tensors
         ok = status.unsqueeze(-1) == Status.OK
         z, metric = torch.where(ok, z, 0.0), _definite(metric, ok)
@@ -157,8 +161,8 @@ class _NearestPoint(torch.autograd.Function):
         return step, of_mu, None, None, None
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple, *tensors: Tensor | None) -> tuple:
-        return _NearestPoint.apply(*in_front(info.batch_size, in_dims, tensors)), (0,) * 5
+    def vmap(info: Any, in_dims: tuple, *inputs: Tensor | float | None) -> tuple:
+        return _NearestPoint.apply(*in_front(info.batch_size, in_dims, inputs)), (0,) * 5
 
 
 class _SolveActive(torch.autograd.Function):
@@ -292,9 +296,9 @@ def on_arrays(of: Callable[..., tuple], A: Tensor, *others: Tensor) -> tuple[Ten
     return tuple(torch.from_numpy(array.reshape((*batch, *array.shape[1:]))).to(device) for array in found)
 
 
-def in_front(size: int, dims: tuple, tensors: tuple) -> list[Tensor | None]:
-    """Tensors of a vmap, its dimension first."""
+def in_front(size: int, dims: tuple, inputs: tuple) -> list[Tensor | float | None]:
+    """What a vmap is given, with its dimension in front of every tensor."""
     return [
-        t if t is None else t.expand(size, *t.shape) if dim is None else t.movedim(dim, 0)
-        for t, dim in zip(tensors, dims, strict=True)
+        t if not isinstance(t, Tensor) else t.expand(size, *t.shape) if dim is None else t.movedim(dim, 0)
+        for t, dim in zip(inputs, dims, strict=True)
     ]

@@ -97,7 +97,6 @@ def simulate(
 
     Raises:
         InputError: shapes do not fit, positions are not finite, `dt` or `steps` is not positive.
-        SolverError: see `solve_safe_qp`.
     """
     if start.ndim != 2 or not bool(start.isfinite().all()):
         raise InputError("start", "finite positions (robots, n)", start)
