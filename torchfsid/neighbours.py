@@ -61,7 +61,7 @@ def nearest_bodies(
     places = x.detach().numpy()
     robot = np.arange(len(x)) if robots is None else np.asarray(robots, dtype=np.int64)
     # One more for the robot itself, one more for the nearest body without a slot; missing ones are infinitely far.
-    distance, body = KDTree(places).query(places[robot], k=[*range(1, count + 3)])
+    distance, body = KDTree(places).query(places[robot], k=count + 2)
     distance[body == robot[:, None]] = -1.0  # the robot itself comes first, also where bodies share its place
     order = np.argsort(distance, axis=1, kind="stable")[:, 1:]
     distance, body = np.take_along_axis(distance, order, 1), np.take_along_axis(body, order, 1)

@@ -145,7 +145,7 @@ class Polygon:
         if use_kernel(None, self.vertices.detach()):
             from torchfsid import polygon_kernel
 
-            rows = map(array, (self.vertices, self.A, self.b, self.count))
+            rows = array(self.vertices), array(self.A), array(self.b), array(self.count)
             basis, centre, radius = map(torch.from_numpy, polygon_kernel.inscribed(*rows, ROUND_OFF))
             if use_kernel(None, self.vertices, self.A, self.b):
                 return centre, radius
