@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from torchfsid.active_set import active_set as active_set
+    from torchfsid.barriers import AffineBarrier as AffineBarrier
     from torchfsid.barriers import Arena as Arena
     from torchfsid.barriers import ClassK as ClassK
-    from torchfsid.barriers import AffineBarrier as AffineBarrier
     from torchfsid.barriers import CollisionAvoidance as CollisionAvoidance
     from torchfsid.barriers import SpeedBox as SpeedBox
     from torchfsid.barriers import SpeedPolygon as SpeedPolygon
