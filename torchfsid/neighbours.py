@@ -80,9 +80,12 @@ def nearest_bodies(
         size = torch.tensor(math.nan) if of_bodies is None else of_bodies.detach().to(torch.float64).max()
         return size.expand(len(index))
 
-    speeds = [v.norm(dim=-1) for v in (u, previous_u) if v is not None]
-    bodies = of_slots(x)
+    bodies, left_out = of_slots(x), None
     assert bodies is not None
+    if not bool(next_one.isinf().all() & present.all()):
+        speeds = [v.norm(dim=-1) for v in (u, previous_u) if v is not None]
+        speed = largest(torch.cat(speeds) if speeds else None)
+        left_out = LeftOut(next_one.clamp(max=within), speed, largest(radius))
     return Measurement(
         t=t,
         x=x[index],
@@ -93,7 +96,7 @@ def nearest_bodies(
         previous_body_velocities=of_slots(previous_u),
         radius=own(radius),
         body_radii=of_slots(radius),
-        left_out=LeftOut(next_one.clamp(max=within), largest(torch.cat(speeds) if speeds else None), largest(radius)),
+        left_out=left_out,
     )
 
 
