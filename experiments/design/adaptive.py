@@ -10,13 +10,17 @@ The projection is `torchfsid.layers.ProjectOnto`, so whatever the gain is made o
     NetworkGain     the same with Lambda+ = r Lambda + G'G/(s R), Gamma = (Lambda+)^-1/(s R); the distrust s > 0 of this
                     sample and the memory 0 < r < 1 are a network's answer to how large Theta is, the case, the noise
 
+No gain moves the estimate while G = 0, or along the row of case B: there the set alone knows more. A gain that `pulls`
+may then step from where the projection has left the estimate towards the centroid c of Theta,
+theta+ + a (c - theta+), 0 < a < 1, which stays in Theta because it is convex.
+
 Gamma G' = P G'(G P G' + R I)^-1 with P = Lambda^-1: the second is the Kalman gain, in its information form.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -26,20 +30,21 @@ from torchfsid.halfspaces import Halfspaces
 from torchfsid.kkt import CASES
 from torchfsid.layers import ProjectOnto
 
-FORGETS_LITTLE = 7.0
-"""The network's memory before training: r = exp(-softplus(-7)) = 0.999."""
+UNTRAINED = (0.0, 7.0, -3.0)
+"""What the network puts out before training: s = 1, r = 0.999, a = 0.05."""
 
 
 class Step(NamedTuple):
     """What an instant says about B robots.
 
     Attributes:
-        theta_set: Theta(t). area: its area [m^2]. case: index into `CASES`.
+        theta_set: Theta(t). area: its area [m^2]. centroid: its centre of area [m]. case: index into `CASES`.
         G, f: of the observed active set. u: measured [m/s]. noise: bound of its disturbance [m/s].
     """
 
     theta_set: Halfspaces
     area: Float[Tensor, "B"]
+    centroid: Float[Tensor, "B 2"]
     case: Int[Tensor, "B"]
     G: Float[Tensor, "B 2 2"]
     f: Float[Tensor, "B 2"]
@@ -47,10 +52,12 @@ class Step(NamedTuple):
     noise: float
 
 
-class Gain(Protocol):
-    """Gamma (B, 2, 2), and the information matrix (B, 2, 2) that is carried on."""
+class Update(NamedTuple):
+    """Gamma, the information matrix that is carried on, and the pull a (None: no pull)."""
 
-    def __call__(self, step: Step, information: Tensor) -> tuple[Tensor, Tensor]: ...
+    Gamma: Float[Tensor, "B 2 2"]
+    information: Float[Tensor, "B 2 2"]
+    pull: Float[Tensor, "B"] | None = None
 
 
 class ConstantGain(nn.Module):
@@ -61,49 +68,61 @@ class ConstantGain(nn.Module):
         self.log_share = nn.Parameter(torch.tensor(math.log(share), dtype=torch.float64))
         self.kp = kp
 
-    def forward(self, step: Step, information: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, step: Step, information: Tensor) -> Update:
         identity = torch.eye(2, dtype=torch.float64).expand_as(information)
-        return self.log_share.exp() / self.kp**2 * identity, information
+        return Update(self.log_share.exp() / self.kp**2 * identity, information)
 
 
 class RlsGain(nn.Module):
-    """Recursive least squares with the noise as it is declared."""
+    """Recursive least squares with the noise as it is declared, and if given a constant `pull`."""
 
-    def forward(self, step: Step, information: Tensor) -> tuple[Tensor, Tensor]:
+    def __init__(self, pull: float | None = None):
+        super().__init__()
+        self.pull = pull
+
+    def forward(self, step: Step, information: Tensor) -> Update:
         R = step.noise**2 / 4
         information = information + step.G.mT @ step.G / R
-        return _inverse(information) / R, information
+        pull = None if self.pull is None else torch.full_like(step.area, self.pull)
+        return Update(_inverse(information) / R, information, pull)
+
+
+class Answer(NamedTuple):
+    """What the network says of B robots: see the module's head."""
+
+    distrust: Float[Tensor, "B"]
+    memory: Float[Tensor, "B"]
+    pull: Float[Tensor, "B"]
 
 
 class NetworkGain(nn.Module):
     """Recursive least squares, with distrust and memory from a network; before training nearly `RlsGain`.
 
     Attributes:
-        prior_area: [m^2], the unit of areas. speed: [m/s], the unit of noise.
+        prior_area: [m^2], the unit of areas. speed: [m/s], the unit of noise. pulls: towards the centroid, too.
     """
 
-    def __init__(self, hidden: int, prior_area: float, speed: float):
+    def __init__(self, hidden: int, prior_area: float, speed: float, pulls: bool):
         super().__init__()
-        self.prior_area, self.speed = prior_area, speed
+        self.prior_area, self.speed, self.pulls = prior_area, speed, pulls
         self.inner = nn.Linear(2 + len(CASES), hidden, dtype=torch.float64)
-        self.outer = nn.Linear(hidden, 2, dtype=torch.float64)
+        self.outer = nn.Linear(hidden, len(Answer._fields), dtype=torch.float64)
         nn.init.zeros_(self.outer.weight)
         with torch.no_grad():
-            self.outer.bias.copy_(torch.tensor([0.0, FORGETS_LITTLE]))
+            self.outer.bias.copy_(torch.tensor(UNTRAINED))
 
-    def answer(self, area: Tensor, case: Tensor, noise: float) -> tuple[Tensor, Tensor]:
-        """Distrust s and memory r."""
+    def answer(self, area: Tensor, case: Tensor, noise: float) -> Answer:
         level = torch.full_like(area, math.log(noise / self.speed) / 5)
         sizes = torch.stack([(area / self.prior_area).log() / 10, level], dim=-1)
         cases = nn.functional.one_hot(case, len(CASES)).to(torch.float64)
-        distrust, memory = self.outer(torch.tanh(self.inner(torch.cat([sizes, cases], dim=-1)))).unbind(-1)
-        return distrust.exp(), (-nn.functional.softplus(-memory)).exp()
+        distrust, memory, pull = self.outer(torch.tanh(self.inner(torch.cat([sizes, cases], dim=-1)))).unbind(-1)
+        return Answer(distrust.exp(), memory.sigmoid(), pull.sigmoid())
 
-    def forward(self, step: Step, information: Tensor) -> tuple[Tensor, Tensor]:
-        distrust, memory = self.answer(step.area, step.case, step.noise)
+    def forward(self, step: Step, information: Tensor) -> Update:
+        distrust, memory, pull = self.answer(step.area, step.case, step.noise)
         R = (distrust * step.noise**2 / 4)[:, None, None]
         information = memory[:, None, None] * information + step.G.mT @ step.G / R
-        return _inverse(information) / R, information
+        return Update(_inverse(information) / R, information, pull if self.pulls else None)
 
 
 class AdaptiveObserver(nn.Module):
@@ -124,11 +143,13 @@ class AdaptiveObserver(nn.Module):
         """The estimates after each sample, from a first estimate and its information matrix (inverse covariance)."""
         estimates = []
         for step in steps:
-            Gamma, information = self.gain(step, information)
+            Gamma, information, pull = self.gain(step, information)
             innovation = step.u - _times(step.G, theta) - step.f
             theta = theta + _times(Gamma, _times(step.G.mT, innovation))
             if self.project is not None:
                 theta = self.project(step.theta_set, theta).point
+            if pull is not None:
+                theta = theta + pull.unsqueeze(-1) * (step.centroid - theta)
             estimates.append(theta)
         return torch.stack(estimates)
 

@@ -186,7 +186,7 @@ class LearnedObserverConfig(DesignConfig):
     Attributes:
         team: what teams are drawn from. teams: how many.
         noise: bounds of the disturbance of the executed velocities [m/s], in training. unseen_noise: in the comparison.
-        gains: constant gains Gamma kp^2 from which the hand-tuned one is taken.
+        gains: constant gains Gamma kp^2 from which the hand-tuned one is taken. pulls: likewise constant pulls.
         times: at which errors are reported [s].
         active_tolerance: distance to its boundary below which a row counts as active, beyond the noise [m/s].
     """
@@ -197,6 +197,7 @@ class LearnedObserverConfig(DesignConfig):
     noise: Annotated[tuple[Positive, ...], Field(min_length=1)]
     unseen_noise: Annotated[tuple[Positive, ...], Field(min_length=1)]
     gains: Annotated[tuple[Positive, ...], Field(min_length=1)]
+    pulls: Annotated[tuple[Annotated[Positive, Field(lt=1)], ...], Field(min_length=1)]
     training: TrainingConfig
     times: Annotated[tuple[NonNegative, ...], Field(min_length=1)]
     active_tolerance: Positive = 1e-3

@@ -73,7 +73,7 @@ def _check(probing: Probing, placements: Tensor, goals: Tensor, horizon: int) ->
     step = probing.config.gradient_check.step
     leaf = placements.clone().requires_grad_()
     area = probing.outcome(leaf, goals, horizon).area
-    differences = {objective: torch.zeros_like(placements) for objective in OBJECTIVES}
+    differences: dict[Objective, Tensor] = {objective: torch.zeros_like(placements) for objective in OBJECTIVES}
     for direction in _steps(placements, step):
         with torch.no_grad():
             ahead, behind = (probing.outcome(at, goals, horizon).area for at in (leaf + direction, leaf - direction))

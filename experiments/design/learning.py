@@ -5,7 +5,7 @@ A run leaves, beside the resolved config.yaml,
     runs.csv       a row per observer, noise and team: the mean error of its robots, over time and at `times` [m]
     curves.csv     a row per observer, noise and sample: the mean error over all robots [m]
     training.csv   a row per trained gain and epoch: mean errors on the training and the validation teams [m]
-    answers.csv    what the trained network answers: a row per noise, case and area
+    answers.csv    what the trained network with pull answers: a row per noise, case and area
     gains.json     the trained gains, whole
     summary.json   means, and their differences to plain recursive least squares with standard errors over teams
 """
@@ -43,14 +43,16 @@ def learn(config: LearnedObserverConfig, out: Path, track: Track) -> dict[str, A
     seen = [record(config, *job, filters=False) for job in track(jobs, "Simulating", len(jobs))]
     training, validation = seen[:levels], seen[levels:]
 
+    tuned_pull = min(config.pulls, key=lambda a: float(_error(AdaptiveObserver(RlsGain(a)), validation)))
     tuned = min(config.gains, key=lambda share: float(_error(_constant(config, share), validation)))
     torch.manual_seed(int(start_seed.generate_state(1)[0]))
     prior = torch.tensor(config.prior.upper) - torch.tensor(config.prior.lower)
-    network = NetworkGain(config.training.hidden, float(prior.prod()), float(np.median(config.noise)))
+    sizes = config.training.hidden, float(prior.prod()), float(np.median(config.noise))
+    networks = {"network": NetworkGain(*sizes, pulls=False), "network with pull": NetworkGain(*sizes, pulls=True)}
     constant, curves = ConstantGain(tuned, config.gain), []
     learned = {
         "constant, learned": AdaptiveObserver(constant),
-        "network": AdaptiveObserver(network),
+        **{name: AdaptiveObserver(network) for name, network in networks.items()},
     }
     for name, observer in learned.items():
         curves += train(name, observer, training, validation, config, track)
@@ -58,6 +60,7 @@ def learn(config: LearnedObserverConfig, out: Path, track: Track) -> dict[str, A
         "constant": _constant(config, tuned),
         **learned,
         "RLS": AdaptiveObserver(RlsGain()),
+        "RLS with pull": AdaptiveObserver(RlsGain(tuned_pull)),
         "constant, not projected": AdaptiveObserver(ConstantGain(tuned, config.gain), projects=False),
         "RLS, not projected": AdaptiveObserver(RlsGain(), projects=False),
     }
@@ -82,14 +85,15 @@ def learn(config: LearnedObserverConfig, out: Path, track: Track) -> dict[str, A
     write_rows(out / "runs.csv", runs)
     write_rows(out / "curves.csv", samples)
     write_rows(out / "training.csv", curves)
-    write_rows(out / "answers.csv", _answers(network, config))
+    write_rows(out / "answers.csv", _answers(networks["network with pull"], config))
     states = {name: {key: value.tolist() for key, value in of.state_dict().items()} for name, of in learned.items()}
     write_json(out / "gains.json", states)
     summary = {
         "title": config.title,
         "seed": config.seed,
         "hand-tuned gain times kp^2": tuned,
-        "learned gain times kp^2": float(constant.log_share.exp()),
+        "hand-tuned pull": tuned_pull,
+        "learned gain times kp^2": float(constant.log_share.detach().exp()),
         "share of samples at which the set holds the truth": contains,
         **summarise(runs, config),
     }
@@ -148,16 +152,16 @@ def _rows(name: str, noise: float, error: Float[Tensor, "T B"], config: LearnedO
 
 
 def _answers(network: NetworkGain, config: LearnedObserverConfig) -> list[dict[str, Any]]:
-    """Distrust and memory over sizes of Theta from the prior's down to where noise leaves it."""
-    shares = torch.logspace(-6, 0, 25, dtype=torch.float64)
+    """Distrust, memory and pull, from the prior's area down to where noise leaves Theta."""
+    areas = network.prior_area * torch.logspace(-6, 0, 25, dtype=torch.float64)
     rows = []
     for noise in config.noise:
         for case, letter in enumerate(CASES):
             with torch.no_grad():
-                index = torch.full((len(shares),), case)
-                distrust, memory = network.answer(shares * network.prior_area, index, noise)
-            columns = zip((shares * network.prior_area).tolist(), distrust.tolist(), memory.tolist(), strict=True)
-            rows += [{"noise": noise, "case": letter, "area": a, "distrust": s, "memory": r} for a, s, r in columns]
+                answer = network.answer(areas, torch.full((len(areas),), case), noise)
+            for area, *values in zip(areas.tolist(), *(of.tolist() for of in answer), strict=True):
+                said = dict(zip(answer._fields, values, strict=True))
+                rows.append({"noise": noise, "case": letter, "area": area, **said})
     return rows
 
 

@@ -102,8 +102,9 @@ def record(
             kkt = estimate.kkt
             # A sample that says nothing moves no estimate.
             G = torch.where(estimate.informative[:, None, None], kkt.G, 0.0)
-            steps.append(Step(theta_set.facets().halfspaces, theta_set.volume(), kkt.case, G, kkt.f, u, noise))
-            estimates["centroid"].append(estimate.theta)
+            facets, area, centroid = theta_set.facets().halfspaces, theta_set.volume(), estimate.theta
+            steps.append(Step(facets, area, centroid, kkt.case, G, kkt.f, u, noise))
+            estimates["centroid"].append(centroid)
             contained.append(theta_set.contains(goals.flatten(0, 1)).double().mean())
     return Recording(
         steps,

@@ -143,8 +143,10 @@ def _descend(
         areas = search.probing.outcome(placements, search.goals).area
         means = found.add(placements, areas)
         optimiser.zero_grad()
-        expectation(areas, settings.objective).sum().backward()
-        optimiser.step()
+        expected = expectation(areas, settings.objective).sum()
+        if expected.requires_grad:  # it does not where no start changes anything
+            expected.backward()
+            optimiser.step()
         with torch.no_grad():
             placements.copy_(search.probing.allowed(placements))
     return placements.detach(), means

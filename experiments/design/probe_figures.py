@@ -1,0 +1,198 @@
+"""Probe placement in two figures: the search (landscape, methods, gradients), and what a probe changes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Rectangle
+
+from experiments.design.config import ProbePlacementConfig
+from experiments.design.tables import read_json, read_rows
+from experiments.figures.drawing import add_goal, add_region, add_robot
+from experiments.figures.style import HYBRID, INACTIVE, INVERSE_OPTIMAL, REGION, ROBOT, UKF
+
+PROBE = INVERSE_OPTIMAL
+TICKS = [digit * 10.0**power for power in range(-6, 3) for digit in (1, 2, 3, 5, 7)]
+METHODS = {
+    "none": ("no probe", "0.4"),
+    "one_random": ("one at random", "0.4"),
+    "random": ("best of as many, random", HYBRID),
+    "grid": ("best of as many, grid", "#56B4E9"),
+    "near_path": ("best of as many, near the path", "#7F5539"),
+    "cem": ("cross-entropy method", UKF),
+    "adam": ("Adam", REGION),
+}
+"""Label and colour of each method."""
+
+
+def draw_search(folder: Path, config: ProbePlacementConfig) -> Figure:
+    figure = Figure(figsize=(11.5, 5.6), layout="constrained")
+    grid = figure.add_gridspec(2, 2, height_ratios=(1.35, 1), width_ratios=(1.25, 1))
+    _landscape(figure.add_subplot(grid[0, 0]), folder, config)
+    _methods(figure.add_subplot(grid[:, 1]), folder, config)
+    _cosines(figure.add_subplot(grid[1, 0]), folder)
+    figure.suptitle(f"{config.title}: {config.scenes} corridors, held-out goals", fontsize=9, x=0.01, ha="left")
+    return figure
+
+
+def _landscape(axes: Axes, folder: Path, config: ProbePlacementConfig) -> None:
+    rows = read_rows(folder / "landscape.csv")
+    columns, lines = config.landscape
+    mean = np.array([float(row["mean_area"] or "nan") for row in rows]).reshape(lines, columns)
+    (left, bottom), (right, top) = config.room.lower, config.room.upper
+    colours = LogNorm(np.nanmin(mean), np.nanmax(mean))
+    image = axes.imshow(mean, extent=(left, right, bottom, top), origin="lower", norm=colours, cmap="viridis")
+    assert axes.figure is not None
+    bar = axes.figure.colorbar(image, ax=axes, pad=0.01, shrink=0.95)
+    bar.set_label("mean area left [m²]")
+    bar.set_ticks([tick for tick in TICKS if colours.vmin <= tick <= colours.vmax], labels=None)
+    bar.ax.minorticks_off()
+    bar.ax.yaxis.set_major_formatter("{x:g}")
+
+    first = read_json(folder / "placements.json")[0]
+    _corridor(axes, first["obstacles"], config)
+    start_x, start_y = config.start
+    axes.add_patch(Circle((start_x, start_y), config.safety_distance, fc="none", ec="white", ls=":", lw=1))
+    descent = [row for row in read_rows(folder / "descent.csv") if row["way_points"] == "1"]
+    for start in sorted({int(row["start"]) for row in descent}):
+        steps = _unbroken([row for row in descent if int(row["start"]) == start], config)
+        path = np.array([(float(row["x0"]), float(row["y0"])) for row in steps])
+        axes.plot(*path.T, color="white", lw=0.7, alpha=0.8)
+        axes.plot(*path[0], "o", color="white", ms=2.4)
+    for name, marker in (("random", "s"), ("grid", "D"), ("cem", "P"), ("adam", "*")):
+        x, y = first["chosen"]["1"][name][0]
+        label, colour = METHODS[name]
+        axes.plot(x, y, marker, color=colour, ms=12 if name == "adam" else 7, mec="black", mew=0.8, label=label, ls="")
+    lower, upper = np.array(config.prior.lower), np.array(config.prior.upper)
+    width, height = upper - lower
+    axes.add_patch(Rectangle(tuple(lower), width, height, fc="none", ec="white", ls="--", lw=1))
+    x, y = (lower + upper) / 2
+    axes.text(x, y, "goals", color="white", ha="center", va="center")
+    axes.set(xlabel="x of a probe that stands still [m]", ylabel="y [m]", xlim=(left, right), ylim=(bottom, top))
+    axes.set_title("(a) the area a still probe leaves; white: Adam's ways", fontweight="bold")
+    axes.legend(loc="lower right", frameon=True, framealpha=0.85, edgecolor="none", fontsize=7)
+
+
+def _unbroken(rows: list[dict[str, str]], config: ProbePlacementConfig) -> list[dict[str, str]]:
+    """Half-way the best starts go on under new numbers: the first half alone is a path from each start."""
+    return [row for row in rows if int(row["step"]) < (config.search.steps + 1) // 2]
+
+
+def _corridor(axes: Axes, obstacles: list[list[float]], config: ProbePlacementConfig) -> None:
+    for x, y in obstacles:
+        axes.add_patch(Circle((x, y), config.safety_distance / 2, fc=INACTIVE, ec="0.4", lw=0.6, zorder=2))
+    add_robot(axes, config.start, config.safety_distance / 2, ROBOT)
+
+
+def _methods(axes: Axes, folder: Path, config: ProbePlacementConfig) -> None:
+    rows = read_rows(folder / "runs.csv")
+    ticks: list[float] = []
+    labels, y = [], 0.0
+    for K in config.way_points:
+        still = "a probe that stands still" if K == 1 else f"a path of {K} way-points"
+        axes.text(0.01, y, still, transform=axes.get_yaxis_transform(), fontstyle="italic", va="center")
+        for name, (label, colour) in METHODS.items():
+            areas = np.array([float(r["mean_area"]) for r in rows if (r["method"], r["way_points"]) == (name, str(K))])
+            if len(areas) == 0:
+                continue
+            y -= 1
+            spread = np.linspace(-0.22, 0.22, len(areas))
+            axes.plot(areas, y + spread, "o", color=colour, ms=3, alpha=0.6, mew=0)
+            axes.plot([areas.mean()] * 2, [y - 0.38, y + 0.38], color=colour, lw=2.4)
+            axes.text(1.02, y, f"{areas.mean():.3g}", transform=axes.get_yaxis_transform(), va="center", fontsize=7)
+            ticks.append(y)
+            labels.append(label)
+        y -= 1.3
+    axes.set(
+        yticks=ticks, yticklabels=labels, xscale="log", xlabel="mean area left [m²]; a dot per corridor, bar: mean"
+    )
+    axes.set_ylim(min(ticks) - 0.6, 0.6)
+    axes.grid(True, axis="x")
+    number = config.search.starts * config.search.steps
+    axes.set_title(f"(b) the methods, {number} placements each", fontweight="bold")
+
+
+def _cosines(axes: Axes, folder: Path) -> None:
+    rows = read_rows(folder / "gradient_check.csv")
+    for objective, colour in (("area", REGION), ("log_area", UKF)):
+        for K, marker in zip(sorted({row["way_points"] for row in rows}, key=int), "os^", strict=False):
+            of = [row for row in rows if row["objective"] == objective and row["way_points"] == K]
+            horizon = [int(row["horizon"]) for row in of]
+            name = {"area": "A", "log_area": "log A"}[objective]
+            for column, dashes, which in (("cosine", "-", "with"), ("cosine_without", ":", "without")):
+                label = f"{name}, {which} score" if marker == "o" else None
+                values = [float(row[column]) for row in of]
+                axes.plot(horizon, values, dashes, color=colour, marker=marker, ms=4, lw=1.3, label=label)
+    axes.axhline(0.95, color="0.6", lw=0.6)
+    axes.set(xlabel="samples", ylabel="cosine", ylim=(-1.05, 1.05))
+    axes.set_title("(c) gradient of the mean over goals against differences", fontweight="bold")
+    axes.grid(True)
+    axes.legend(fontsize=7, title="circles: still, squares: path", title_fontsize=7, loc="center right")
+
+
+def draw_before_after(folder: Path, config: ProbePlacementConfig) -> Figure:
+    replay = read_json(folder / "replay.json")
+    runs: list[dict[str, Any]] = replay["runs"]
+    figure = Figure(figsize=(11.5, 4.6), layout="constrained")
+    grid = figure.subplots(2, 1 + (len(runs) - 1 + 1) // 2, squeeze=False)
+    cells = [grid[0, 0], *grid[0, 1:], *grid[1, 1:]]
+    order = [runs[0], *_by_way_points(runs[1:])]
+    for letter, axes, run in zip("abcdefgh", cells, order, strict=False):
+        draw_map(axes, replay, run, config, len(run["samples"]) - 1)
+        axes.set_title(f"({letter}) {name_of(run)}: {run['samples'][-1]['area']:.3g} m²", fontweight="bold")
+    curves = grid[1, 0]
+    for run in order:
+        t = [sample["t"] for sample in run["samples"]]
+        colour = METHODS[run["method"]][1]
+        dashes = "-" if run["way_points"] != 1 else "--"
+        areas = [sample["area"] for sample in run["samples"]]
+        curves.semilogy(t, areas, color=colour, ls=dashes, lw=1.5, label=name_of(run))
+    curves.set(xlabel="t [s]", ylabel="area of Θ(t) [m²]")
+    curves.set_title("(f) over time", fontweight="bold")
+    curves.grid(True)
+    curves.legend(fontsize=7)
+    figure.suptitle(
+        f"{config.title}: what is left of Θ after {config.duration:g} s, for one goal", fontsize=9, x=0.01, ha="left"
+    )
+    return figure
+
+
+def _by_way_points(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A row of maps for each method, its columns the numbers of way-points."""
+    return sorted(runs, key=lambda run: (run["method"] != "random", run["way_points"]))
+
+
+def name_of(run: dict[str, Any]) -> str:
+    if run["way_points"] == 0:
+        return "no probe"
+    what = {"random": "best random", "adam": "Adam's"}[run["method"]]
+    return f"{what} {'point' if run['way_points'] == 1 else 'path'}"
+
+
+def draw_map(axes: Axes, replay: dict[str, Any], run: dict[str, Any], config: ProbePlacementConfig, k: int) -> None:
+    """The corridor at sample k: Theta, the robot and where it came from, the probe and its way."""
+    sample, radius = run["samples"][k], config.safety_distance / 2
+    lower, upper = np.array(config.prior.lower), np.array(config.prior.upper)
+    width, height = upper - lower
+    axes.add_patch(Rectangle(tuple(lower), width, height, fc="none", ec=REGION, ls=":", lw=0.8))
+    add_region(axes, np.array(sample["vertices"]), REGION, filled=True)
+    active = sample["active"]
+    bodies = [*replay["obstacles"], *([sample["probe"]] if sample["probe"] else [])]
+    for i, (x, y) in enumerate(bodies):
+        is_probe = i == len(replay["obstacles"])
+        face = PROBE if is_probe else INACTIVE
+        axes.add_patch(
+            Circle((x, y), radius, fc=face, ec="black" if i in active else "0.55", lw=1.6 if i in active else 0.6)
+        )
+    if run["way_point_places"]:
+        axes.plot(*np.array(run["way_point_places"]).T, "-", color=PROBE, lw=0.8, marker=".", ms=4, zorder=6)
+    axes.plot(*np.array([s["x"] for s in run["samples"][: k + 1]]).T, color=ROBOT, lw=1.2, zorder=6)
+    add_robot(axes, sample["x"], radius, ROBOT)
+    add_goal(axes, replay["goal"])
+    (left, bottom), (right, top) = config.room.lower, config.room.upper
+    axes.set(xlim=(left - 0.1, max(right, upper[0]) + 0.1), ylim=(bottom, top), aspect="equal")
