@@ -226,7 +226,9 @@ def test_dump_loads_back_to_the_same_configuration(raw, tmp_path_factory):
     path = tmp_path_factory.getbasetemp() / "resolved.yaml"
     path.write_text(dump(config), encoding="utf-8")
     assert load(path, ObserveConfig) == config
-    assert [barrier.build([]) for barrier in load(path, ObserveConfig).barriers] == [b.build([]) for b in config.barriers]
+    assert [barrier.build([]) for barrier in load(path, ObserveConfig).barriers] == [
+        b.build([]) for b in config.barriers
+    ]
 
 
 # What is refused, and how.

@@ -45,12 +45,14 @@ def _landscape(axes: Axes, folder: Path, config: ProbePlacementConfig) -> None:
     columns, lines = config.landscape
     mean = np.array([float(row["mean_area"] or "nan") for row in rows]).reshape(lines, columns)
     (left, bottom), (right, top) = config.room.lower, config.room.upper
-    colours = LogNorm(np.nanmin(mean), np.nanmax(mean))
-    image = axes.imshow(mean, extent=(left, right, bottom, top), origin="lower", norm=colours, cmap="viridis")
+    low, high = np.nanmin(mean), np.nanmax(mean)
+    image = axes.imshow(
+        mean, extent=(left, right, bottom, top), origin="lower", norm=LogNorm(low, high), cmap="viridis"
+    )
     assert axes.figure is not None
     bar = axes.figure.colorbar(image, ax=axes, pad=0.01, shrink=0.95)
     bar.set_label("mean area left [m²]")
-    bar.set_ticks([tick for tick in TICKS if colours.vmin <= tick <= colours.vmax], labels=None)
+    bar.set_ticks([tick for tick in TICKS if low <= tick <= high])
     bar.ax.minorticks_off()
     bar.ax.yaxis.set_major_formatter("{x:g}")
 
