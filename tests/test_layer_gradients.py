@@ -233,3 +233,20 @@ def test_what_the_exact_solver_refuses():
     cone = cp.Problem(cp.Minimize(cp.sum_squares(z - q)), [cp.norm(z) <= 1])
     with pytest.raises(InputError, match="linear constraints"):
         CvxpyLayer(cone, [q], [z], solver=ActiveRowsSolver())
+
+
+@pytest.mark.parametrize("p", [1, 2, 3])
+def test_compiled_first_derivatives_are_those_of_the_graph(p):
+    """With no graph asked for, numba's; with one, torch's. Among the sets are empty and unbounded ones."""
+    A, b, y = (t.requires_grad_() for t in random_sets(200, 2 * p + 2, p, seed=80 + p, least=-0.2))
+    halfspaces = Halfspaces(A, b)
+    point, ball = EXACT_POINT(halfspaces, y).point, EXACT_BALL(halfspaces)
+    assert ball.status.unique().tolist() == [Status.OK, Status.EMPTY, Status.UNBOUNDED]
+    weights = torch.randn(200, p, dtype=torch.float64)
+    for loss in ((point * weights).sum(), (ball.centre * weights).sum(), ball.radius.sum()):
+        compiled = torch.autograd.grad(loss, (A, b, y), retain_graph=True, allow_unused=True)
+        graph = torch.autograd.grad(loss, (A, b, y), create_graph=True, allow_unused=True)
+        for mine, theirs in zip(compiled, graph, strict=True):
+            assert (mine is None) == (theirs is None)
+            if mine is not None:
+                torch.testing.assert_close(mine, theirs, atol=1e-10, rtol=1e-9)

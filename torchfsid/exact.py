@@ -10,7 +10,18 @@ from enum import IntEnum
 import numpy as np
 
 from torchfsid import active_rows
-from torchfsid.active_rows import PARALLEL, Mask, Reals, inscribed_rows, nearest_rows, times
+from torchfsid.active_rows import (
+    MOST_ROUNDS,
+    PARALLEL,
+    TIE,
+    Indices,
+    Mask,
+    Reals,
+    inscribed_rows,
+    nearest_rows,
+    simplex_around,
+    times,
+)
 from torchfsid.halfspaces import ROUND_OFF
 
 
@@ -31,6 +42,15 @@ class Status(IntEnum):
 
 def nearest_point(A: Reals, b: Reals, y: Reals, metric: Reals | None = None, parallel: float = PARALLEL) -> tuple:
     """Point, multipliers, active rows, the places they fill, status."""
+    B, m, p = A.shape
+    if active_rows.installed() and metric is None:
+        from torchfsid import programmes_kernel as kernel
+
+        z, mu, at = np.zeros((B, p)), np.zeros((B, p)), np.zeros((B, p), dtype=np.int64)
+        filled, status = np.zeros((B, p), dtype=bool), np.zeros(B, dtype=np.int64)
+        most = MOST_ROUNDS * (m + p)
+        kernel.nearest_point(A, b, y, parallel, ROUND_OFF, most, z, mu, at, filled, status)
+        return z, mu, at, filled, status
     finite = np.isfinite(A.sum((1, 2)) + b.sum(-1) + y.sum(-1))
     rows = A
     if metric is not None:
@@ -40,12 +60,12 @@ def nearest_point(A: Reals, b: Reals, y: Reals, metric: Reals | None = None, par
     unit, offsets, impossible = _unit(rows, b - times(A, y), finite)
     found = nearest_rows(unit, offsets, parallel)
     ok = finite & ~found.empty & ~impossible
-    filled = ok[:, None] & (np.arange(A.shape[-1]) < found.count[:, None])
+    filled = ok[:, None] & (np.arange(p) < found.count[:, None])
     z = found.point if metric is None else np.linalg.solve(root.swapaxes(-1, -2), found.point[..., None])[..., 0]
     # Once more, as a correction: this removes the round-off of a distant y, and gives the given rows' own multipliers.
     z, pull = np.where(ok[:, None], y + z, 0.0), np.where(ok[:, None], -z, 0.0)
     pull = pull if metric is None else times(metric, pull)
-    at = np.arange(len(A))[:, None]
+    at = np.arange(B)[:, None]
     N = np.where(filled[..., None], A[at, found.rows], 0.0)
     correction, mu = solve_active(N, filled, pull, np.where(filled, b[at, found.rows], 0.0) - times(N, z), metric)
     status = np.where(finite, np.where(ok, Status.OK, Status.EMPTY), Status.UNDEFINED)
@@ -64,12 +84,20 @@ def solve_active(N: Reals, filled: Mask, pull: Reals, offsets: Reals, metric: Re
 
 def inscribed_ball(A: Reals, b: Reals) -> tuple:
     """Centre, radius, the rows that decide them (m and above: at infinity), status."""
+    B, m, p = A.shape
+    if active_rows.installed():
+        from torchfsid import programmes_kernel as kernel
+
+        centre, radius = np.zeros((B, p)), np.zeros(B)
+        rows, status = np.zeros((B, p + 1), dtype=np.int64), np.zeros(B, dtype=np.int64)
+        most = MOST_ROUNDS * (m + p)
+        kernel.inscribed_ball(A, b, simplex_around(p), TIE, ROUND_OFF, most, centre, radius, rows, status)
+        return centre, radius, rows, status
     finite = np.isfinite(A.sum((1, 2)) + b.sum(-1))
-    m, p = A.shape[1:]
     unit, offsets, impossible = _unit(A, b, finite)
     found = inscribed_rows(unit, offsets)
     ball, radius = found.ball, found.ball[:, p]
-    size = np.abs(offsets[np.arange(len(A))[:, None], found.rows.clip(max=m - 1)]).max(-1) + np.abs(ball).sum(-1)
+    size = np.abs(offsets[np.arange(B)[:, None], found.rows.clip(max=m - 1)]).max(-1) + np.abs(ball).sum(-1)
     thin = np.abs(radius) <= ROUND_OFF * size
     undecided = ~finite | impossible | found.open_radius
     status = np.where(thin, Status.DEGENERATE, np.where(radius < 0, Status.EMPTY, Status.OK))
@@ -82,6 +110,28 @@ def inscribed_ball(A: Reals, b: Reals) -> tuple:
     ):
         radius[mask], status[mask] = value, what
     return ball[:, :p], radius, np.where(undecided[:, None], m + np.arange(p + 1), found.rows), status
+
+
+def of_nearest_point(
+    A: Reals, rows: Indices, filled: Mask, mu: Reals, z: Reals, status: Indices, of_z: Reals, of_mu: Reals
+) -> tuple:
+    """The derivative with respect to A, b and y of a sum weighted by of_z and of_mu, compiled."""
+    from torchfsid import programmes_kernel as kernel
+
+    of_A, of_b, of_y = np.zeros_like(A), np.zeros(A.shape[:2]), np.zeros_like(z)
+    kernel.of_nearest_point(A, rows, filled, mu, z, status, of_z, of_mu, of_A, of_b, of_y)
+    return of_A, of_b, of_y
+
+
+def of_inscribed_ball(
+    A: Reals, centre: Reals, radius: Reals, rows: Indices, of_centre: Reals, of_radius: Reals
+) -> tuple:
+    """The derivative with respect to A and b of a sum weighted by of_centre and of_radius, compiled."""
+    from torchfsid import programmes_kernel as kernel
+
+    of_A, of_b = np.zeros_like(A), np.zeros(A.shape[:2])
+    kernel.of_inscribed_ball(A, centre, radius, rows, simplex_around(A.shape[2]), of_centre, of_radius, of_A, of_b)
+    return of_A, of_b
 
 
 def _roots(metric: Reals) -> tuple[Reals, Mask]:

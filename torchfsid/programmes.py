@@ -24,7 +24,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchfsid import exact
+from torchfsid import active_rows, exact
 from torchfsid.active_rows import PARALLEL, simplex_around
 from torchfsid.errors import InputError
 from torchfsid.exact import Status
@@ -131,6 +131,9 @@ class _NearestPoint(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, of_z: Tensor, of_mu: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
         A, y, metric, z, mu, rows, filled, status = ctx.saved_tensors
+        if metric is None and _first_derivatives_suffice():
+            saved = A, rows, filled, mu, z, status
+            return *on_arrays(exact.of_nearest_point, *saved, of_z, of_mu), None, None
         ok = status.unsqueeze(-1) == Status.OK
         z, metric = torch.where(ok, z, 0.0), _definite(metric, ok)
         N, index = _taken(A, rows)
@@ -235,6 +238,9 @@ class _InscribedBall(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, of_centre: Tensor, of_radius: Tensor, *_: Tensor) -> tuple[Tensor, Tensor]:
         A, centre, radius, rows = ctx.saved_tensors
+        if _first_derivatives_suffice():
+            of_A, of_b = on_arrays(exact.of_inscribed_ball, A, centre, radius, rows, of_centre, of_radius)
+            return of_A, of_b
         M, touching, real, rows, index = _InscribedBall._system(A, centre, radius, rows)
         given = torch.cat([of_centre, of_radius.unsqueeze(-1)], dim=-1)
         found = torch.cat([centre, radius.unsqueeze(-1)], dim=-1).isfinite()
@@ -266,6 +272,11 @@ def _finite(values: Tensor) -> Tensor:
     return torch.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
 
 
+def _first_derivatives_suffice() -> bool:
+    """Then they can be compiled: no graph of them is asked for, and no transform (vmap, jvp) looks through them."""
+    return active_rows.installed() and not torch.is_grad_enabled() and not torch._C._are_functorch_transforms_active()
+
+
 def _taken(A: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
     index = rows.unsqueeze(-1).expand(*rows.shape, A.shape[-1])
     return A.gather(-2, index), index
@@ -290,7 +301,9 @@ def times(M: Tensor, v: Tensor) -> Tensor:
 def on_arrays(of: Callable[..., tuple], A: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
     """A function of numpy arrays with one batch dimension, on tensors with any number; A is a batch of matrices."""
     batch, device = A.shape[:-2], A.device
-    arrays = (t.detach().cpu().numpy().reshape((batch.numel(), *t.shape[len(batch) :])) for t in (A, *others))
+    arrays = (
+        t.detach().cpu().contiguous().numpy().reshape((batch.numel(), *t.shape[len(batch) :])) for t in (A, *others)
+    )
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         found = of(*arrays)
     return tuple(torch.from_numpy(array.reshape((*batch, *array.shape[1:]))).to(device) for array in found)
