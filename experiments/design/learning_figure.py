@@ -23,7 +23,7 @@ OBSERVERS = {
 }
 """Those that are drawn: colour and dashes. The others are in the tables."""
 
-CASES = {"A": "0.45", "B": INVERSE_OPTIMAL, "D": ROBOT}
+CASES = {"A": "0.8", "B": INVERSE_OPTIMAL, "D": ROBOT}
 
 
 def draw_learning(folder: Path, config: LearnedObserverConfig) -> Figure:
@@ -42,8 +42,7 @@ def draw_learning(folder: Path, config: LearnedObserverConfig) -> Figure:
         axes.set(xlabel="t [s]", ylabel="mean error [m]" if i == 0 else "")
         axes.set_title(f"({'abcdef'[i]}) unseen teams, δ = {noise:g} m/s", fontweight="bold")
         axes.grid(True, which="both")
-        if i == 0:
-            axes.legend(fontsize=6.5, loc="lower left", ncols=2)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=9, fontsize=7)
 
     training = figure.add_subplot(grid[1, :3])
     rows = read_rows(folder / "training.csv")
@@ -64,10 +63,10 @@ def draw_learning(folder: Path, config: LearnedObserverConfig) -> Figure:
             of = [row for row in rows if row["case"] == letter and float(row["noise"]) == noise]
             label = f"case {letter}" if dashes == "-" else None
             area, answer = ([float(row[key]) for row in of] for key in ("area", "pull"))
-            pull.semilogx(area, answer, color=colour, ls=dashes, lw=1.3, label=label)
+            pull.semilogx(area, answer, color=colour, ls=dashes, lw=4 if letter == "A" else 1.3, label=label)
     pull.set(xlabel="area of Θ [m²]", ylabel="pull to the centroid", ylim=(0, 1))
     pull.set_title("(e) what the network has learned (solid: least noise)", fontweight="bold")
     pull.grid(True)
     pull.legend(fontsize=7)
-    figure.suptitle(f"{config.title}: point estimates from the same data", fontsize=9, x=0.01, ha="left")
+    figure.suptitle(config.title, fontsize=9, x=0.01, ha="left")
     return figure
