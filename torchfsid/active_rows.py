@@ -102,8 +102,10 @@ def nearest_rows(A: Reals, b: Reals, parallel: float = PARALLEL) -> NearestRows:
     A, b = A[items], b[items]
     at, slots = np.arange(len(items)), np.arange(p)
     # Per item: the active rows, how many, the row that is being pushed (-1: none), its multiplier so far.
-    rows, count = np.zeros((len(items), p), dtype=np.int64), np.zeros(len(items), dtype=np.int64)
-    entering, push = np.full(len(items), -1), np.zeros(len(items))
+    rows: Indices = np.zeros((len(items), p), dtype=np.int64)
+    count: Indices = np.zeros(len(items), dtype=np.int64)
+    entering: Indices = np.full(len(items), -1)
+    push: Reals = np.zeros(len(items))
     for _ in range(MOST_ROUNDS * (m + p)):
         if len(items) == 0:
             return found
@@ -154,7 +156,7 @@ def nearest_rows(A: Reals, b: Reals, parallel: float = PARALLEL) -> NearestRows:
         if stopped.any():
             on = ~stopped
             items, at = items[on], at[: on.sum()]
-            A, b, rows, count, entering, push = (array[on] for array in (A, b, rows, count, entering, push))
+            A, b, rows, count, entering, push = _kept(on, A, b, rows, count, entering, push)
     found.empty[items] = True
     return found
 
@@ -209,8 +211,8 @@ def inscribed_rows(A: Reals, b: Reals) -> InscribedRows:
                 found.open_radius[stopped] = w_far[done, p] > TIE
             on = ~done
             items, at = items[on], at[: on.sum()]
-            A, b, basis, M, right, far, V, share, n, q, bound = (
-                array[on] for array in (A, b, basis, M, right, far, V, share, n, q, bound)
+            A, b, basis, M, right, far, V, share, n, q, bound = _kept(
+                on, A, b, basis, M, right, far, V, share, n, q, bound
             )
         slot = _leaving(V, share)
         basis[at, slot], M[at, slot], right[at, slot], far[at, slot] = q, n, bound, 0.0
@@ -305,6 +307,10 @@ def inverse(W: Reals) -> Reals:
         V[:, 0], V[:, 1], V[:, 2] = yz.T, zx.T, xy.T
         determinant = (x * yz).sum(0)
     return V / determinant[:, None, None]
+
+
+def _kept(items: Mask, *arrays: Reals) -> tuple[Reals, ...]:
+    return tuple(array[items] for array in arrays)
 
 
 def times(M: Reals, v: Reals) -> Reals:
