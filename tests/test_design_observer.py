@@ -22,8 +22,10 @@ from torchfsid.halfspaces import Halfspaces
 CONFIG = Path(__file__).parents[1] / "configs" / "learned_observer.yaml"
 SMALL = (
     "teams={train: 1, validation: 1, test: 2}",
-    "duration=0.3",
+    "duration=0.2",
     "times=[0.1]",
+    "gains=[0.3, 1.0]",
+    "pulls=[0.05]",
     "noise=[0.01]",
     "unseen_noise=[0.02]",
     "training.epochs=2",

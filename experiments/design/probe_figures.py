@@ -17,6 +17,9 @@ from experiments.figures.drawing import add_goal, add_region, add_robot
 from experiments.figures.style import HYBRID, INACTIVE, INVERSE_OPTIMAL, REGION, ROBOT, UKF
 
 PROBE = INVERSE_OPTIMAL
+SEEN = 0.95
+"""The map shows the places from which a probe brings the area below this share of the largest, and the robot."""
+
 TICKS = [digit * 10.0**power for power in range(-6, 3) for digit in (1, 2, 3, 5, 7)]
 METHODS = {
     "none": ("no probe", "0.4"),
@@ -50,7 +53,7 @@ def _landscape(axes: Axes, folder: Path, config: ProbePlacementConfig) -> None:
         mean, extent=(left, right, bottom, top), origin="lower", norm=LogNorm(low, high), cmap="viridis"
     )
     assert axes.figure is not None
-    bar = axes.figure.colorbar(image, ax=axes, pad=0.01, shrink=0.95)
+    bar = axes.figure.colorbar(image, ax=axes, pad=0.01, shrink=0.7)
     bar.set_label("mean area left [m²]")
     bar.set_ticks([tick for tick in TICKS if low <= tick <= high])
     bar.ax.minorticks_off()
@@ -59,7 +62,7 @@ def _landscape(axes: Axes, folder: Path, config: ProbePlacementConfig) -> None:
     first = read_json(folder / "placements.json")[0]
     _corridor(axes, first["obstacles"], config)
     start_x, start_y = config.start
-    axes.add_patch(Circle((start_x, start_y), config.safety_distance, fc="none", ec="white", ls=":", lw=1))
+    axes.add_patch(Circle((start_x, start_y), config.safety_distance, fc="none", ec="black", ls=":", lw=1))
     descent = [row for row in read_rows(folder / "descent.csv") if row["way_points"] == "1"]
     for start in sorted({int(row["start"]) for row in descent}):
         steps = _unbroken([row for row in descent if int(row["start"]) == start], config)
@@ -70,14 +73,13 @@ def _landscape(axes: Axes, folder: Path, config: ProbePlacementConfig) -> None:
         x, y = first["chosen"]["1"][name][0]
         label, colour = METHODS[name]
         axes.plot(x, y, marker, color=colour, ms=12 if name == "adam" else 7, mec="black", mew=0.8, label=label, ls="")
-    lower, upper = np.array(config.prior.lower), np.array(config.prior.upper)
-    width, height = upper - lower
-    axes.add_patch(Rectangle(tuple(lower), width, height, fc="none", ec="white", ls="--", lw=1))
-    x, y = (lower + upper) / 2
-    axes.text(x, y, "goals", color="white", ha="center", va="center")
+    places = np.array([(float(row["x"]), float(row["y"])) for row in rows])
+    matter = np.nan_to_num(mean.ravel(), nan=0.0) < (SEEN * high if low < SEEN * high else np.inf)
+    left, bottom = np.maximum(places[matter].min(0) - 0.1, config.room.lower)
+    right, top = np.minimum(places[matter].max(0) + 0.1, config.room.upper)
     axes.set(xlabel="x of a probe that stands still [m]", ylabel="y [m]", xlim=(left, right), ylim=(bottom, top))
     axes.set_title("(a) the area a still probe leaves; white: Adam's ways", fontweight="bold")
-    axes.legend(loc="lower right", frameon=True, framealpha=0.85, edgecolor="none", fontsize=7)
+    axes.legend(loc="upper right", frameon=True, framealpha=0.85, edgecolor="none", fontsize=7)
 
 
 def _unbroken(rows: list[dict[str, str]], config: ProbePlacementConfig) -> list[dict[str, str]]:
@@ -157,7 +159,8 @@ def draw_before_after(folder: Path, config: ProbePlacementConfig) -> Figure:
     curves.set(xlabel="t [s]", ylabel="area of Θ(t) [m²]")
     curves.set_title("(f) over time", fontweight="bold")
     curves.grid(True)
-    curves.legend(fontsize=7)
+    curves.set_ylim(bottom=curves.get_ylim()[0] / 8)
+    curves.legend(fontsize=7, loc="lower left")
     figure.suptitle(
         f"{config.title}: what is left of Θ after {config.duration:g} s, for one goal", fontsize=9, x=0.01, ha="left"
     )
