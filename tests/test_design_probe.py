@@ -222,6 +222,7 @@ def test_a_run_can_be_repeated_from_its_folder_and_is_drawn(tmp_path: Path):
         ("avoidance.neighbour_velocity=current", "avoidance.neighbour_velocity"),
         ("prior.upper=[2, 1]", "prior"),
         ("way_points=[1, 1]", "way_points"),
+        ("way_points=[3]", "way_points"),
         ("obstacles=[[1, 1]]", "obstacles"),
         ("search.finalists=999", "search.finalists"),
         ("gradient_check.horizons=[99]", "gradient_check.horizons"),

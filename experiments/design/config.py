@@ -127,7 +127,7 @@ class ProbePlacementConfig(DesignConfig):
     Attributes:
         start: of the robot [m]. obstacles: of the corridor [m].
         scenes: corridors in which it is tried, each with obstacles moved by at most `jitter` [m] along each axis.
-        way_points: numbers of way-points; 1 is a probe that stands still.
+        way_points: numbers of way-points, 1 (a probe that stands still) among them.
         room: where way-points may be [m].
         set, active_tolerance [m/s], velocity_noise [m/s]: of the observer; the last for `inverse_optimal`.
         landscape: columns and rows of the grid of places.
@@ -152,6 +152,8 @@ class ProbePlacementConfig(DesignConfig):
     def _fits(self) -> ProbePlacementConfig:
         if len(set(self.way_points)) < len(self.way_points):
             raise wrong(f"expected different numbers, got {list(self.way_points)}", "way_points")
+        if 1 not in self.way_points:
+            raise wrong("expected 1 among them: the landscape is that of a probe that stands still", "way_points")
         if self.search.finalists > self.search.starts * self.search.steps:
             raise wrong("more than there are placements", "search.finalists")
         if max(self.gradient_check.horizons) > self.steps:

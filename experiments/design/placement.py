@@ -86,8 +86,8 @@ class _Corridor:
         chosen = choose(search, found, self.validation)
         seconds = time.perf_counter() - started
         self.chosen.setdefault(K, {})[method] = chosen
-        if method == "adam":
-            self.descent += _descent(K, found)
+        if method == "adam" and K == 1:
+            self.descent += _descent(found)
         simulations = sum(map(len, found.means)) * self.config.goals.train
         simulations += self.config.search.finalists * self.config.goals.validation
         rows = [self._judge(method, chosen, simulations, seconds)]
@@ -174,13 +174,12 @@ def _grid(probing: Probing, columns: int, rows: int) -> Tensor:
     return lower + (upper - lower) * torch.cartesian_prod(y, x).flip(-1)
 
 
-def _descent(K: int, found: Evaluated) -> list[dict[str, Any]]:
+def _descent(found: Evaluated) -> list[dict[str, Any]]:
+    batches = zip(found.placements[found.screened :], found.means[found.screened :], strict=True)
     return [
-        {"way_points": K, "step": step, "start": i, "mean_area": mean}
-        | {f"{axis}{k}": q[k][j] for k in range(K) for j, axis in enumerate("xy")}
-        for step, (placements, means) in enumerate(zip(found.placements, found.means, strict=True))
-        for i, (q, mean) in enumerate(zip(placements.tolist(), means.tolist(), strict=True))
-        if K == 1
+        {"step": step, "start": i, "x": x, "y": y, "mean_area": mean}
+        for step, (placements, means) in enumerate(batches)
+        for i, (((x, y),), mean) in enumerate(zip(placements.tolist(), means.tolist(), strict=True))
     ]
 
 

@@ -63,10 +63,9 @@ def _landscape(axes: Axes, folder: Path, config: ProbePlacementConfig) -> None:
     _corridor(axes, first["obstacles"], config)
     start_x, start_y = config.start
     axes.add_patch(Circle((start_x, start_y), config.safety_distance, fc="none", ec="black", ls=":", lw=1))
-    descent = [row for row in read_rows(folder / "descent.csv") if row["way_points"] == "1"]
-    for start in sorted({int(row["start"]) for row in descent}):
-        steps = _unbroken([row for row in descent if int(row["start"]) == start], config)
-        path = np.array([(float(row["x0"]), float(row["y0"])) for row in steps])
+    descent = read_rows(folder / "descent.csv")
+    for start in sorted({row["start"] for row in descent}):
+        path = np.array([(float(row["x"]), float(row["y"])) for row in descent if row["start"] == start])
         axes.plot(*path.T, color="white", lw=0.7, alpha=0.8)
         axes.plot(*path[0], "o", color="white", ms=2.4)
     for name, marker in (("random", "s"), ("grid", "D"), ("cem", "P"), ("adam", "*")):
@@ -80,11 +79,6 @@ def _landscape(axes: Axes, folder: Path, config: ProbePlacementConfig) -> None:
     axes.set(xlabel="x of a probe that stands still [m]", ylabel="y [m]", xlim=(left, right), ylim=(bottom, top))
     axes.set_title("(a) the area a still probe leaves; white: Adam's ways", fontweight="bold")
     axes.legend(loc="upper right", frameon=True, framealpha=0.85, edgecolor="none", fontsize=7)
-
-
-def _unbroken(rows: list[dict[str, str]], config: ProbePlacementConfig) -> list[dict[str, str]]:
-    """Half-way the best starts go on under new numbers: the first half alone is a path from each start."""
-    return [row for row in rows if int(row["step"]) < (config.search.steps + 1) // 2]
 
 
 def _corridor(axes: Axes, obstacles: list[list[float]], config: ProbePlacementConfig) -> None:

@@ -8,7 +8,7 @@ that no method has seen.
     random        the best of as many places drawn from the room
     near_path     the best of as many places drawn near the path predicted without a probe
     cem           the cross-entropy method: generations from a Gaussian fitted to the best of the generation before
-    adam          Adam from many starts near the predicted path, projected onto the allowed placements
+    adam          Adam from the best of many starts near the predicted path, projected onto the allowed placements
 """
 
 from __future__ import annotations
@@ -29,13 +29,18 @@ COARSEST = 1e-3
 TURN = 1.0
 """Standard deviation of the way from one way-point to the next around the robot [rad]."""
 
+SCREENED, DESCENDING = 0.2, 0.5
+"""Adam's share of simulations that go into choosing starts; how many it goes on from, relative to `starts`."""
+
 
 @dataclass
 class Evaluated:
-    """Placements in the order of their evaluation, and their mean areas over the training goals [m^2]."""
+    """Placements in the order of their evaluation, and their mean areas over the training goals [m^2]; the first
+    `screened` batches only chose where to start from."""
 
     placements: list[Float[Tensor, "P K 2"]] = field(default_factory=list)
     means: list[Float[Tensor, "P"]] = field(default_factory=list)
+    screened: int = 0
 
     def add(self, placements: Float[Tensor, "P K 2"], areas: Float[Tensor, "P S"]) -> Float[Tensor, "P"]:
         self.placements.append(placements.detach().clone())
@@ -119,37 +124,30 @@ def cem(search: Search) -> Evaluated:
 
 
 def adam(search: Search) -> Evaluated:
-    """Adam on all starts at a time, after each step the nearest allowed placements; half-way, the best quarter goes on
-    alone with four times as many steps, of a length that falls to zero."""
+    """Adam from the best of many starts, all at a time, in steps whose length falls to zero; after each, the nearest
+    allowed placements. From most starts there is no way down: there the probe changes nothing, or comes too close."""
     found, settings = Evaluated(), search.probing.config.search
-    first, kept = (settings.steps + 1) // 2, max(settings.starts // 4, 1)
-    placements, means = _descend(search, found, search.near_path(settings.starts), first, None)
-    last = (settings.steps - first) * settings.starts // kept
-    _descend(search, found, placements[means.argsort()[:kept]], last, last)
-    return found
-
-
-def _descend(
-    search: Search, found: Evaluated, placements: Float[Tensor, "P K 2"], steps: int, falling: int | None
-) -> tuple[Float[Tensor, "P K 2"], Float[Tensor, "P"]]:
-    """The placements after so many steps of Adam, and the mean areas of those before the last step."""
-    settings = search.probing.config.search
-    placements = placements.clone().requires_grad_()
+    for _ in range(max(round(SCREENED * settings.steps), 1)):
+        placements = search.near_path(settings.starts)
+        found.add(placements, search.evaluate(placements))
+    found.screened = len(found.means)
+    kept = max(round(DESCENDING * settings.starts), 1)
+    order = torch.cat(found.means).argsort()
+    placements = torch.cat(found.placements)[order[:kept]].requires_grad_()
+    steps = (settings.starts * settings.steps - len(order)) // kept
     optimiser = torch.optim.Adam([placements], lr=settings.learning_rate)
-    means = placements.new_zeros(len(placements))
     for k in range(steps):
-        if falling is not None:
-            optimiser.param_groups[0]["lr"] = settings.learning_rate * (1 - k / falling)
+        optimiser.param_groups[0]["lr"] = settings.learning_rate * (1 - k / steps)
         areas = search.probing.outcome(placements, search.goals).area
-        means = found.add(placements, areas)
+        found.add(placements, areas)
         optimiser.zero_grad()
         expected = expectation(areas, settings.objective).sum()
-        if expected.requires_grad:  # it does not where no start changes anything
+        if expected.requires_grad:  # it does not where no placement changes anything
             expected.backward()
             optimiser.step()
-        with torch.no_grad():
-            placements.copy_(search.probing.allowed(placements))
-    return placements.detach(), means
+            with torch.no_grad():
+                placements.copy_(search.probing.allowed(placements))
+    return found
 
 
 METHODS: dict[str, Callable[[Search], Evaluated]] = {
