@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -63,9 +64,7 @@ def _landscape(axes: Axes, folder: Path, config: ProbePlacementConfig) -> None:
     _corridor(axes, first["obstacles"], config)
     start_x, start_y = config.start
     axes.add_patch(Circle((start_x, start_y), config.safety_distance, fc="none", ec="black", ls=":", lw=1))
-    descent = read_rows(folder / "descent.csv")
-    for start in sorted({row["start"] for row in descent}):
-        path = np.array([(float(row["x"]), float(row["y"])) for row in descent if row["start"] == start])
+    for path in _ways(read_rows(folder / "descent.csv")):
         axes.plot(*path.T, color="white", lw=0.7, alpha=0.8)
         axes.plot(*path[0], "o", color="white", ms=2.4)
     for name, marker in (("random", "s"), ("grid", "D"), ("cem", "P"), ("adam", "*")):
@@ -79,6 +78,15 @@ def _landscape(axes: Axes, folder: Path, config: ProbePlacementConfig) -> None:
     axes.set(xlabel="x of a probe that stands still [m]", ylabel="y [m]", xlim=(left, right), ylim=(bottom, top))
     axes.set_title("(a) the area a still probe leaves; white: Adam's ways", fontweight="bold")
     axes.legend(loc="upper right", frameon=True, framealpha=0.85, edgecolor="none", fontsize=7)
+
+
+def _ways(rows: list[dict[str, str]]) -> list[np.ndarray]:
+    """One array of places per start. Half-way fewer go on, under new numbers: they begin new ways."""
+    together = Counter(row["step"] for row in rows)
+    ways: dict[tuple[int, str], list[tuple[float, float]]] = defaultdict(list)
+    for row in rows:
+        ways[together[row["step"]], row["start"]].append((float(row["x"]), float(row["y"])))
+    return [np.array(way) for way in ways.values()]
 
 
 def _corridor(axes: Axes, obstacles: list[list[float]], config: ProbePlacementConfig) -> None:
