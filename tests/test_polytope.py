@@ -572,11 +572,3 @@ def test_a_batch_is_its_items_and_padding_is_harmless() -> None:
     assert swapped.volume().tolist() == [after.body.volume()[i].item() for i in (2, 1, 1, 3)]
     rebuilt = Polytope(*(getattr(swapped, name) for name in Polytope.__dataclass_fields__))
     assert torch.equal(rebuilt.volume(), swapped.volume())
-
-
-def test_results_carry_no_gradient() -> None:
-    A, b = (tensor(x)[None].requires_grad_() for x in rows_around(np.random.default_rng(0), np.zeros(3), 6, 2.0))
-    body = clip_polytope(box(3), A, b, torch.zeros(1, dtype=torch.float64), torch.arange(6)[None]).body
-    assert not any(
-        result.requires_grad for result in (body.volume(), body.centroid(), *body.chebyshev(), body.support(A))
-    )

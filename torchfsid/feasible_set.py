@@ -2,10 +2,10 @@ r"""The feasible set Theta(t): where the parameter must lie, given everything se
 
     Theta(t) = Theta_0  intersected with all  Omega(tau), tau <= t          Theta_0 a box, the prior
 
-A set is a value: `intersect` returns the next one. In the plane it is a batch of polygons (differentiable), elsewhere a
-batch of polytopes. Its promises: it contains the truth if all half-spaces do; its volume never grows; it stays bounded;
-the order of the half-spaces does not matter; it takes the memory of its facets, of which there are at most
-`max_facets`, merged outward. Each facet remembers when and from which constraint it came.
+A set is a value: `intersect` returns the next one. In the plane it is a batch of polygons, elsewhere a batch of
+polytopes; both are differentiable. Its promises: it contains the truth if all half-spaces do; its volume never grows;
+it stays bounded; the order of the half-spaces does not matter; it takes the memory of its facets, of which there are at
+most `max_facets`, merged outward. Each facet remembers when and from which constraint it came.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class FeasibleSet:
 
     @property
     def dim(self) -> int:
-        return self.body.vertices.shape[-1]
+        return self.body.A.shape[-1]
 
     @property
     def is_empty(self) -> Bool[Tensor, "*batch"]:

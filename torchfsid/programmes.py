@@ -103,6 +103,13 @@ def broadcast(
     return halfspaces, point.to(torch.float64), None if metric is None else metric.to(torch.float64)
 
 
+def solve_active(
+    N: Tensor, filled: Tensor, pull: Tensor, offsets: Tensor, metric: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """z and mu with H z + N' mu = pull, N z = offsets, for the rows `filled` of N, its first ones; with gradients."""
+    return _SolveActive.apply(N, filled, pull, offsets, metric)  # type: ignore[return-value]
+
+
 # With gradients -----------------------------------------------------------------------------------------------------
 
 
