@@ -10,7 +10,7 @@ Where no gradient is needed, `polygon_kernel` does the same in compiled code.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
@@ -21,10 +21,14 @@ from torch import Tensor
 
 from torchfsid.compiled import array, use_kernel
 from torchfsid.halfspaces import ROUND_OFF
-from torchfsid.polygon import PRIOR, Polygon, cross, excess, lengths, round_off, take
+from torchfsid.polygon import PRIOR, Polygon, cross, lengths, round_off, take
+from torchfsid.rings import Rings, chosen, columns
 
 PARALLEL = 1e-14
 """Sine of the angle below which two edges are not extended to their intersection."""
+
+CHUNK = 2048
+"""Polygons that are cut at a time."""
 
 
 class Outcome(IntEnum):
@@ -90,54 +94,26 @@ def clip(
         return _clip_compiled(polygon, A, b, time, source, most)
     outcome = torch.full((len(A),), Outcome.NONEMPTY, device=A.device)
     shrunk = torch.zeros(len(A), dtype=torch.bool, device=A.device)
-    against = Contradiction.none(len(A), A)
-    cuts = _Cuts.of(polygon, A, b)
-    if len(cuts.item) == 0:
+    against, cuts, smaller = Contradiction.none(len(A), A), _Cuts.of(polygon, A, b), []
+    for some in cuts.chunks():
+        part = polygon.select(some.item)
+        table = _Table.of(part, *(field.index_select(0, some.item) for field in (A, b, time, source)))
+        rings, verdict, cut = _cut(Rings.of(part.vertices, part.count), some, table, against)
+        outcome[some.item] = verdict
+        kept = (cut & (verdict != Outcome.EMPTY)).nonzero().squeeze(-1)
+        shrunk[some.item[kept]] = True
+        smaller.append(table.select(kept).polygon(rings.select(kept), part.reach[kept]))
+    if not bool(shrunk.any()):
         return Clipped(polygon, outcome, shrunk, against)
-
-    items = cuts.item
-    before = polygon.select(items)
-    table = _Table.of(before, A[items], b[items], time[items], source[items])
-    rings, finished = _Rings.of(before), []
-    verdict, changed = outcome[items], shrunk[items]
-    for r in range(cuts.b.shape[1]):
-        live = int((cuts.number > r).sum())  # the first ones: they come in the order of how many rows they have
-        finished.append(rings.part(slice(live, None)))
-        rings, a, c = rings.part(slice(live)), cuts.A[:live, r], cuts.b[:live, r].unsqueeze(-1)
-        tolerance, edge = cuts.tolerance[:live, r].unsqueeze(-1), cuts.edge[:live, r].unsqueeze(-1)
-        over = rings.vertices[..., 0] * a[:, :1] + rings.vertices[..., 1] * a[:, 1:] - c
-        kept, surely = over <= tolerance, (over < -tolerance).any(-1)
-        beyond = ~kept.all(-1) & (verdict[:live] != Outcome.EMPTY)
-        empty, cut = beyond & ~kept.any(-1), beyond & surely
-        verdict[:live] = torch.where(empty, Outcome.EMPTY, verdict[:live])
-        verdict[:live] = torch.where(beyond & ~empty & ~surely, Outcome.UNDECIDED, verdict[:live])
-        changed[:live] |= cut
-        if bool(empty.any()):
-            count, closest = rings.count[empty, None], over[empty].argmin(-1, keepdim=True)
-            met = rings.edge[empty].gather(1, torch.cat([(closest - 1) % count, closest % count], dim=-1))
-            lost = empty.nonzero().squeeze(-1)
-            table.select(lost).report(torch.cat([edge[lost], met], dim=-1), items[lost], against)
-        if bool(cut.all()):
-            rings = _cut(rings, over, tolerance, edge, table.padding)
-        elif bool(cut.any()):
-            some = cut.nonzero().squeeze(-1)
-            smaller = _cut(rings.part(some), over[some], tolerance[some], edge[some], table.padding)
-            rings = rings.replaced(some, smaller, table.padding)
-
-    rings = _Rings.join([rings, *reversed(finished)], table.padding)
-    outcome[items] = verdict
-    kept = (changed & (verdict != Outcome.EMPTY)).nonzero().squeeze(-1)
-    smaller = table.select(kept).polygon(rings.part(kept), before.reach[kept])
-    where, keep = items[kept], torch.ones_like(kept, dtype=torch.bool)
-    if most is not None and bool((over_full := smaller.count > most).any()):
-        merged = merge(smaller.select(over_full), most)
+    where, body = cuts.item[shrunk[cuts.item]], Polygon.join(smaller)
+    if most is not None and len(full := (body.count > most).nonzero().squeeze(-1)) > 0:
+        merged = merge(body.select(full), most)
         # The areas are sums in some order.
-        keep[over_full] = merged.volume() <= polygon.select(where[over_full]).volume() * (1 - ROUND_OFF)
-        smaller = smaller.replaced(over_full.nonzero().squeeze(-1), merged)
-    shrunk[where] = keep
-    if not bool(keep.all()):
-        where, smaller = where[keep], smaller.select(keep)
-    return Clipped(polygon.replaced(where, smaller), outcome, shrunk, against)
+        worth = merged.volume() <= polygon.select(where[full]).volume() * (1 - ROUND_OFF)
+        shrunk[where[full[~worth]]] = False
+        kept = shrunk[where].nonzero().squeeze(-1)
+        where, body = where[kept], body.replaced(full, merged).select(kept)
+    return Clipped(polygon.replaced(where, body), outcome, shrunk, against)
 
 
 def _clip_compiled(polygon: Polygon, A: Tensor, b: Tensor, time: Tensor, source: Tensor, most: int | None) -> Clipped:
@@ -161,8 +137,8 @@ def merge(polygon: Polygon, most: int) -> Polygon:
         over = (polygon.count > most).nonzero().squeeze(-1)
         part = polygon.select(over)
         added, corners = _removals(part)
-        possible = added.isfinite().any(-1)
-        if not bool(possible.any()):
+        possible = added.isfinite().any(-1).nonzero().squeeze(-1)
+        if len(possible) == 0:
             return polygon
         dropped = added[possible].argmin(-1, keepdim=True)
         smaller = _without_edge(part.select(possible), dropped, take(corners[possible], dropped))
@@ -174,77 +150,88 @@ class _Cuts(NamedTuple):
 
     Attributes:
         item: which polygon. number: how many rows cut it; the others behind them do not.
-        edge: the number of the edge that a row will make: old edges are numbered by their slots, new ones behind them.
+        row: which of its rows.
+        p, q, b: p x + q y <= b. tolerance: round-off of p x + q y - b.
     """
 
     item: Int[Tensor, "k"]
     number: Int[Tensor, "k"]
-    A: Float[Tensor, "k R 2"]
-    b: Float[Tensor, "k R"]
-    tolerance: Float[Tensor, "k R"]
-    edge: Int[Tensor, "k R"]
+    row: Int[Tensor, "R k"]
+    p: Float[Tensor, "R k"]
+    q: Float[Tensor, "R k"]
+    b: Float[Tensor, "R k"]
+    tolerance: Float[Tensor, "R k"]
 
     @classmethod
     def of(cls, polygon: Polygon, A: Float[Tensor, "B R 2"], b: Float[Tensor, "B R"]) -> _Cuts:
         with torch.no_grad():
-            # Bounding boxes rule most polygons out.
-            lower, upper = polygon.vertices.amin(1).unsqueeze(1), polygon.vertices.amax(1).unsqueeze(1)
-            boxed = excess(A.clamp(min=0), b, upper) + A.clamp(max=0) @ lower.mT
-            item = (boxed > 0).flatten(1).any(-1).nonzero().squeeze(-1)
-            rows, bounds, part = A[item], b[item], polygon.select(item)
-            tolerance = round_off(rows, bounds, part.reach)
-            beyond = excess(rows, bounds, part.trimmed()).amax(-1)
-            cutting = beyond > tolerance
-            number, order = cutting.sum(-1).sort(descending=True)
-            order = order[: int((number > 0).sum())]
-            number, item = number[: len(order)], item[order]
-            depth = torch.where(cutting, beyond / lengths(rows), -torch.inf)[order]
-            first = depth.argsort(dim=-1, descending=True)[:, : int(number.max()) if len(order) else 0]
+            item = _boxed(polygon, A, b)
+            item = item[polygon.count[item].argsort(descending=True)]  # rings of like size have little padding
+            depths, tolerances = [A.new_zeros(0, A.shape[1])], [A.new_zeros(0, A.shape[1])]
+            for some in item.split(CHUNK // 8) if len(item) > 0 else ():
+                rows, bounds = A.index_select(0, some), b.index_select(0, some)
+                slots = int(polygon.count[some[0]])
+                (p, q), (x, y) = columns(rows), columns(polygon.vertices[:, :slots].index_select(0, some))
+                beyond = (p * x.unsqueeze(1) + q * y.unsqueeze(1)).amax(0).T - bounds
+                tolerances.append(round_off(rows, bounds, polygon.reach[some]))
+                depths.append(torch.where(beyond > tolerances[-1], beyond / lengths(rows), -torch.inf))
+            depth, tolerance = torch.cat(depths), torch.cat(tolerances)
+            number, order = depth.isfinite().sum(-1).sort(descending=True, stable=True)
+            number, order = number[: (live := int((number > 0).sum()))], order[:live]
+            item = item[order]
+            row = depth[order].argsort(dim=-1, descending=True)[:, : int(number[0]) if live else 0]
         return cls(
             item=item,
             number=number,
-            A=take(A[item], first),
-            b=b[item].gather(1, first),
-            tolerance=tolerance[order].gather(1, first),
-            edge=polygon.slots + first,
+            row=row.T.contiguous(),
+            p=A[..., 0].index_select(0, item).gather(1, row).T.contiguous(),
+            q=A[..., 1].index_select(0, item).gather(1, row).T.contiguous(),
+            b=b.index_select(0, item).gather(1, row).T.contiguous(),
+            tolerance=tolerance[order].gather(1, row).T.contiguous(),
         )
 
+    def chunks(self) -> Iterator[_Cuts]:
+        """Some items at a time, so that what is computed of them stays in the processor's cache."""
+        for first in range(0, len(self.item), CHUNK):
+            rows = int(self.number[first])
+            yield _Cuts(*(f[first : first + CHUNK] if f.ndim == 1 else f[:rows, first : first + CHUNK] for f in self))
 
-class _Rings(NamedTuple):
-    """Rings being cut: the vertices, and for each vertex the number of the edge that it starts."""
 
-    vertices: Float[Tensor, "k V 2"]
-    edge: Int[Tensor, "k V"]
-    count: Int[Tensor, "k"]
+def _boxed(polygon: Polygon, A: Float[Tensor, "B R 2"], b: Float[Tensor, "B R"]) -> Int[Tensor, "k"]:
+    """The polygons whose bounding boxes some row cuts."""
+    (x, y), (p, q) = columns(polygon.vertices), columns(A)
+    beyond = p * torch.where(p > 0, x.amax(0), x.amin(0)) + q * torch.where(q > 0, y.amax(0), y.amin(0)) > b.T
+    return beyond.any(0).nonzero().squeeze(-1)
 
-    @classmethod
-    def of(cls, polygon: Polygon) -> _Rings:
-        vertices = polygon.trimmed()
-        slots = torch.arange(vertices.shape[1], device=vertices.device)
-        return cls(vertices, slots.expand(vertices.shape[:2]), polygon.count)
 
-    def part(self, items: Tensor | slice) -> _Rings:
-        return _Rings(*(field[items] for field in self))
-
-    def replaced(self, items: Tensor, other: _Rings, padding: int) -> _Rings:
-        slots = max(self.vertices.shape[1], other.vertices.shape[1])
-        mine, theirs = self._widened(slots, padding), other._widened(slots, padding)
-        return _Rings(*(field.index_put((items,), new) for field, new in zip(mine, theirs, strict=True)))
-
-    @classmethod
-    def join(cls, parts: Sequence[_Rings], padding: int) -> _Rings:
-        slots = max(part.vertices.shape[1] for part in parts)
-        wide = (part._widened(slots, padding) for part in parts)
-        return cls(*(torch.cat(fields) for fields in zip(*wide, strict=True)))
-
-    def _widened(self, slots: int, padding: int) -> _Rings:
-        extra = slots - self.vertices.shape[1]
-        if extra == 0:
-            return self
-        return self._replace(
-            vertices=torch.cat([self.vertices, self.vertices[:, :1].expand(-1, extra, 2)], dim=1),
-            edge=torch.nn.functional.pad(self.edge, (0, extra), value=padding),
-        )
+def _cut(rings: Rings, cuts: _Cuts, table: _Table, against: Contradiction) -> tuple[Rings, Tensor, Tensor]:
+    """The rings after all cuts, the `Outcome` of each, and whether it was cut; reports contradictions to `against`."""
+    verdict = torch.full_like(cuts.number, Outcome.NONEMPTY)
+    changed, first_row = torch.zeros_like(verdict, dtype=torch.bool), len(rings.x)
+    turns = torch.arange(len(cuts.b), device=cuts.number.device).unsqueeze(-1)
+    for r, live in enumerate((cuts.number > turns).sum(-1).tolist()):  # the first ones: they have most rows
+        p, q, b, tolerance, row = (f[r, :live] for f in (cuts.p, cuts.q, cuts.b, cuts.tolerance, cuts.row))
+        over = rings.x[:, :live] * p + rings.y[:, :live] * q - b
+        known = over.detach()
+        lowest, deepest = known.min(0)
+        beyond = (known.amax(0) > tolerance) & (verdict[:live] != Outcome.EMPTY)
+        cut = beyond & (lowest < -tolerance)
+        touched = (beyond & ~cut).nonzero().squeeze(-1)
+        if len(touched) > 0:
+            empty = lowest[touched] > tolerance[touched]
+            verdict[touched] = torch.where(empty, Outcome.EMPTY, Outcome.UNDECIDED)
+            lost = touched[empty]
+            closest, count = deepest[lost], rings.count[lost]
+            met = rings.edge[:, lost].gather(0, torch.stack([(closest - 1) % count, closest]))
+            edges = torch.cat([first_row + row[None, lost], met]).T
+            table.select(lost).report(edges, cuts.item[lost], against)
+        some = cut.nonzero().squeeze(-1)
+        if len(some) > 0:
+            changed[some] = True
+            row = first_row + row[some]
+            smaller = rings.select(some).cut(chosen(over, some), tolerance[some], deepest[some], row)
+            rings = rings.replaced(some, smaller)
+    return rings, verdict, changed
 
 
 class _Table(NamedTuple):
@@ -259,63 +246,29 @@ class _Table(NamedTuple):
     def of(cls, polygon: Polygon, A: Tensor, b: Tensor, time: Tensor, source: Tensor) -> _Table:
         old = (polygon.A, polygon.b, polygon.time, polygon.source)
         new = (A, b, time.unsqueeze(-1).expand_as(b), source)
-        return cls(
-            *(torch.cat([o, n, p.unsqueeze(1)], dim=1) for o, n, p in zip(old, new, polygon.padding(), strict=True))
-        )
+        parts = zip(old, new, polygon.padding(), strict=True)
+        return cls(*(torch.cat([o, n, p.unsqueeze(1)], dim=1) for o, n, p in parts))
 
     @property
     def padding(self) -> int:
         return self.b.shape[1] - 1
 
     def select(self, items: Tensor) -> _Table:
-        return _Table(*(field[items] for field in self))
+        if len(items) == len(self.b):
+            return self
+        return _Table(*(field.index_select(0, items) for field in self))
 
-    def polygon(self, rings: _Rings, reach: Tensor) -> Polygon:
-        A, (b, time, source) = take(self.A, rings.edge), (column.gather(1, rings.edge) for column in self[1:])
-        return Polygon(rings.vertices, A, b, time, source, rings.count, reach)
+    def polygon(self, rings: Rings, reach: Tensor) -> Polygon:
+        slot = torch.arange(len(rings.edge), device=reach.device)
+        edge = torch.where(slot < rings.count.unsqueeze(-1), rings.edge.T, self.padding)
+        b, time, source = (column.gather(1, edge) for column in self[1:])
+        return Polygon(rings.vertices(), take(self.A, edge), b, time, source, rings.count, reach)
 
     def report(self, edges: Int[Tensor, "k 3"], items: Tensor, against: Contradiction) -> None:
         """Three edges that contradict each other."""
         against.A[items] = take(self.A, edges).detach()
         for known, column in zip((against.b, against.time, against.source), self[1:], strict=True):
             known[items] = column.gather(1, edges).detach()
-
-
-def _cut(rings: _Rings, over: Tensor, tolerance: Tensor, new: Tensor, padding: int) -> _Rings:
-    """The part of each ring on the inner side of a line that really cuts it: `over` is a.v - c at its vertices.
-
-    The vertices kept form one arc of the ring, first..last, around the deepest vertex; it is closed by the points where
-    the ring leaves and enters the half-plane, unless the arc already ends on the line. `new` numbers the line's edge.
-    """
-    count = rings.count.unsqueeze(-1)
-    slot = torch.arange(over.shape[1], device=count.device)
-    kept = over <= tolerance
-    deepest = over.argmin(-1, keepdim=True)
-    ahead = kept.gather(1, (deepest + slot) % count).long().cumprod(-1).sum(-1, keepdim=True).clamp(max=count)
-    behind = kept.gather(1, (deepest - slot) % count).long().cumprod(-1).sum(-1, keepdim=True).clamp(max=count)
-    length = ahead + behind - 1
-    first, last = (deepest - behind + 1) % count, (deepest + ahead - 1) % count
-    before, after = (first - 1) % count, (last + 1) % count
-    leaves = over.gather(1, last) < -tolerance
-    enters = over.gather(1, first) < -tolerance
-
-    total = length + leaves + enters
-    slot = torch.arange(int(total.max()), device=count.device)
-    position = torch.where(slot < length, (first + slot) % count, first)
-    vertices = take(rings.vertices, position)
-    out, back = (slot == length) & leaves, (slot == length + leaves) & enters
-    vertices = torch.where(out.unsqueeze(-1), _crossing(rings.vertices, over, last, after), vertices)
-    vertices = torch.where(back.unsqueeze(-1), _crossing(rings.vertices, over, first, before), vertices)
-    edge = rings.edge.gather(1, torch.where(slot < length, position, before))
-    edge = torch.where(slot == length - 1 + leaves, new, edge).masked_fill(slot >= total, padding)
-    return _Rings(vertices, edge, total.squeeze(-1))
-
-
-def _crossing(vertices: Tensor, over: Tensor, inner: Tensor, outer: Tensor) -> Float[Tensor, "k 1 2"]:
-    """Where the ring meets the line, between a vertex within and one beyond."""
-    s_inner, s_outer = over.gather(1, inner), over.gather(1, outer)
-    start, end = take(vertices, inner), take(vertices, outer)
-    return start + (s_inner / (s_inner - s_outer)).unsqueeze(-1) * (end - start)
 
 
 def _removals(polygon: Polygon) -> tuple[Float[Tensor, "B V"], Float[Tensor, "B V 2"]]:

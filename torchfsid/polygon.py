@@ -12,6 +12,7 @@ Everything is differentiable in the vertices and rows, twice. Clipping is in `cl
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -66,25 +67,28 @@ class Polygon:
         """Slots that hold a vertex (and its edge)."""
         return torch.arange(self.slots, device=self.count.device) < self.count.unsqueeze(-1)
 
-    def trimmed(self) -> Float[Tensor, "B W 2"]:
-        """The vertices, without the slots that no polygon of the batch needs."""
-        return self.vertices[:, : int(self.count.max())] if len(self.count) > 0 else self.vertices
+    def select(self, items: Int[Tensor, "k"]) -> Polygon:
+        """The sub-batch at `items`, without the slots that none of it needs."""
+        count = self.count[items]
+        slots = int(count.max()) if len(count) > 0 else 0
+        rings = (self.vertices, self.A, self.b, self.time, self.source)
+        vertices, A, b, time, source = (field[:, :slots].index_select(0, items) for field in rings)
+        return Polygon(vertices, A, b, time, source, count, self.reach[items])
 
-    def select(self, items: Tensor) -> Polygon:
-        """The sub-batch at `items` (indices or a mask)."""
-        return Polygon(*(field[items] for field in self.fields()))
-
-    def replaced(self, items: Tensor, other: Polygon) -> Polygon:
-        """This batch with `other` in the places `items`."""
+    def replaced(self, items: Int[Tensor, "k"], other: Polygon) -> Polygon:
+        """This batch with `other` in the places `items`, and no more slots than that needs."""
         if len(items) == 0:
             return self
-        slots = max(self.slots, other.slots)
-        return Polygon(
-            *(
-                mine.index_put((items,), theirs)
-                for mine, theirs in zip(self._widened(slots).fields(), other._widened(slots).fields(), strict=True)
-            )
-        )
+        staying = self.count.index_fill(0, items, 0)
+        slots = max(int(staying.max()), int(other.count.max()))
+        mine, theirs = self._resized(slots).fields(), other._resized(slots).fields()
+        return Polygon(*(field.index_copy(0, items, new) for field, new in zip(mine, theirs, strict=True)))
+
+    @classmethod
+    def join(cls, parts: Sequence[Polygon]) -> Polygon:
+        """Batches behind each other."""
+        slots = max(part.slots for part in parts)
+        return cls(*map(torch.cat, zip(*(part._resized(slots).fields() for part in parts), strict=True)))
 
     def fields(self) -> tuple[Tensor, ...]:
         return self.vertices, self.A, self.b, self.time, self.source, self.count, self.reach
@@ -94,15 +98,18 @@ class Polygon:
         nothing = torch.zeros_like(self.b[:, 0])
         return torch.zeros_like(self.A[:, 0]), nothing + 1, nothing + torch.nan, torch.full_like(self.count, PRIOR)
 
-    def _widened(self, slots: int) -> Polygon:
+    def _resized(self, slots: int) -> Polygon:
         extra = slots - self.slots
         if extra == 0:
             return self
-        first, fields = self.vertices[:, 0], (self.vertices, self.A, self.b, self.time, self.source)
-        vertices, A, b, time, source = (
-            torch.cat([field, fill.unsqueeze(1).expand(-1, extra, *fill.shape[1:])], dim=1)
-            for field, fill in zip(fields, (first, *self.padding()), strict=True)
-        )
+        fields = (self.vertices, self.A, self.b, self.time, self.source)
+        if extra < 0:
+            vertices, A, b, time, source = (field[:, :slots] for field in fields)
+        else:
+            vertices, A, b, time, source = (
+                torch.cat([field, fill.unsqueeze(1).expand(-1, extra, *fill.shape[1:])], dim=1)
+                for field, fill in zip(fields, (self.vertices[:, 0], *self.padding()), strict=True)
+            )
         return Polygon(vertices, A, b, time, source, self.count, self.reach)
 
     # What is asked of a polygon ------------------------------------------------------------------------------------
@@ -243,4 +250,4 @@ def excess(A: Float[Tensor, "B R 2"], b: Float[Tensor, "B R"], z: Float[Tensor, 
 
 def round_off(A: Float[Tensor, "B R 2"], b: Float[Tensor, "B R"], reach: Float[Tensor, "B 2"]) -> Float[Tensor, "B R"]:
     """Round-off of A z - b at points that came from coordinates as large as `reach`."""
-    return (ROUND_OFF * ((A.abs() @ reach.unsqueeze(-1)).squeeze(-1) + b.abs())).detach()
+    return (ROUND_OFF * (A[..., 0].abs() * reach[:, :1] + A[..., 1].abs() * reach[:, 1:] + b.abs())).detach()
