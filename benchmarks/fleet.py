@@ -2,8 +2,9 @@
 
 The whole observer update (rows from positions, active set, KKT conditions, half-spaces, clipping) for fleets of 1 to
 100 000 robots with 8 neighbours each (`scenario`), from the prior on: robot-updates per second of CPU time on one
-thread. The search of the neighbours, which the observer does not do, is given beside it. Then one robot, update by
-update, and a fleet over many steps, whose cost must not grow.
+thread; ten fleets of 1000, so that each size has its share of robots. The search of the neighbours, which the observer
+does not do, is given beside it. Then one robot, update by update, and a fleet over many steps, whose cost must not
+grow.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from benchmarks import save
 from benchmarks.scenario import NEIGHBOURS, Fleet, measured, observer
 from torchfsid.compiled import installed
 
-SIZES, BLOCK = (1_000, 10_000, 100_000), 10
+SIZES, LEAST, BLOCK = (1_000, 10_000, 100_000), 10_000, 10
 
 
 def _blocks(fleet: Fleet, steps: int) -> Iterator[list[tuple[float, Tensor, Tensor]]]:
@@ -32,30 +33,34 @@ def _blocks(fleet: Fleet, steps: int) -> Iterator[list[tuple[float, Tensor, Tens
         yield block
 
 
-def run(robots: int, steps: int, noisy: bool, compiled: bool) -> dict:
-    """A fleet from the prior on; times per robot and update [us]."""
-    fleet, spent, search, cut, used, active = Fleet(robots, noisy), [], 0.0, 0, 0, 0
-    watching = observer(fleet.prior(), compiled)
-    for moments in _blocks(fleet, steps):
-        began = time.process_time()
-        block = [measured(*moment) for moment in moments]
-        search += time.process_time() - began
-        for measurement in block:
+def run(robots: int, steps: int, noisy: bool, compiled: bool, fleets: int = 1) -> dict:
+    """Some fleets from the prior on, one after the other; times per robot and update [us]."""
+    spent, search, cut, used, active, lost = [], 0.0, 0, 0, 0, 0
+    for seed in range(fleets):
+        fleet = Fleet(robots, noisy, seed)
+        watching = observer(fleet.prior(), compiled)
+        for moments in _blocks(fleet, steps):
             began = time.process_time()
-            estimate = watching.update(measurement)
-            spent.append(time.process_time() - began)
-            cut += int((estimate.feasible_set.last_cut == measurement.t).sum())
-            used += int(estimate.informative.sum())
-            active += int((estimate.kkt.n_active > 0).sum())
-    body, count = watching.feasible_set.body, robots * steps
-    lost = int((~watching.feasible_set.contains(fleet.goals)).sum())
+            block = [measured(*moment) for moment in moments]
+            search += time.process_time() - began
+            for measurement in block:
+                began = time.process_time()
+                estimate = watching.update(measurement)
+                spent.append(time.process_time() - began)
+                cut += int((estimate.feasible_set.last_cut == measurement.t).sum())
+                used += int(estimate.informative.sum())
+                active += int((estimate.kkt.n_active > 0).sum())
+        lost += int((~watching.feasible_set.contains(fleet.goals)).sum())
+    body, count = watching.feasible_set.body, robots * steps * fleets
+    late = np.array(spent).reshape(fleets, steps)[:, -steps // 4 :]
     return {
         "robots": robots,
+        "fleets": fleets,
         "steps": steps,
         "noisy": noisy,
         "per_second": count / sum(spent),
         "microseconds": 1e6 * sum(spent) / count,
-        "last_microseconds": 1e6 * float(np.median(spent[-steps // 4 :])) / robots,
+        "last_microseconds": 1e6 * float(np.median(late)) / robots,
         "search_microseconds": 1e6 * search / count,
         "share_cut": cut / count,
         "share_used": used / count,
@@ -106,9 +111,9 @@ def main(arguments: list[str]) -> None:
     ways = {"torch": False} | ({"compiled": True} if installed() else {})
     results: dict = {"neighbours": NEIGHBOURS}
     for way, compiled in ways.items():
-        run(3, 2, True, compiled)  # compile, and load what loads late
-        fleets = [(robots, noisy) for noisy in (False, True) for robots in SIZES if robots <= options.largest]
-        rows = [run(robots, options.steps, noisy, compiled) for robots, noisy in fleets]
+        run(1000, 2, True, compiled)  # compile, and load what loads late
+        sizes = [(robots, noisy) for noisy in (False, True) for robots in SIZES if robots <= options.largest]
+        rows = [run(B, options.steps, noisy, compiled, max(1, LEAST // B)) for B, noisy in sizes]
         alone, long = run_alone(2000, compiled), run_long(200, options.long, compiled)
         results[way] = {"fleets": rows, "alone": alone, "long": long}
         print(f"\n{way}")
