@@ -176,8 +176,9 @@ class SpeedBox:
             raise InputError("limit", "positive speeds [m/s]", self.limit)
 
     def __call__(self, measurement: Measurement) -> Halfspaces:
-        identity = torch.eye(len(self.limit), dtype=torch.float64)
-        limits = torch.tensor(self.limit * 2, dtype=torch.float64)
+        x = measurement.x
+        identity = torch.eye(len(self.limit), dtype=torch.float64, device=x.device)
+        limits = torch.tensor(self.limit * 2, dtype=torch.float64, device=x.device)
         return _constant(torch.cat([identity, -identity]), limits, measurement)
 
     def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
@@ -201,10 +202,11 @@ class SpeedPolygon:
             raise InputError("speed_polygon", "sides >= 3 and limit > 0", (self.sides, self.limit))
 
     def __call__(self, measurement: Measurement) -> Halfspaces:
-        angles = torch.arange(self.sides, dtype=torch.float64) * (2 * math.pi / self.sides)
+        side = torch.arange(self.sides, dtype=torch.float64, device=measurement.x.device)
+        angles = side * (2 * math.pi / self.sides)
         normals = torch.stack([angles.cos(), angles.sin()], dim=-1)
         apothem = self.limit * math.cos(math.pi / self.sides)
-        return _constant(normals, torch.full((self.sides,), apothem, dtype=torch.float64), measurement)
+        return _constant(normals, torch.full_like(angles, apothem), measurement)
 
     def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
         return _exact(self.sides, bounds)
@@ -229,7 +231,7 @@ class Arena:
 
     def __call__(self, measurement: Measurement) -> Halfspaces:
         h = self._distances(measurement.x)
-        identity = torch.eye(len(self.lower), dtype=torch.float64)
+        identity = torch.eye(len(self.lower), dtype=torch.float64, device=h.device)
         return Halfspaces(torch.cat([identity, -identity]).expand(*h.shape, len(self.lower)), self.class_k(h))
 
     def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
@@ -240,8 +242,8 @@ class Arena:
         return [f"wall {sign}{axis}" for sign in "+-" for axis in "xyz"[: len(self.lower)]]
 
     def _distances(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch 2*n"]:
-        to_upper = torch.tensor(self.upper, dtype=torch.float64) - self.margin - x
-        to_lower = x - torch.tensor(self.lower, dtype=torch.float64) - self.margin
+        lower, upper = (torch.tensor(side, dtype=torch.float64, device=x.device) for side in (self.lower, self.upper))
+        to_upper, to_lower = upper - self.margin - x, x - lower - self.margin
         return torch.cat([to_upper, to_lower], dim=-1)
 
 

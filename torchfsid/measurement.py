@@ -89,8 +89,9 @@ class Measurement:
         if u is not None and u.shape != x.shape:
             raise InputError("u", f"velocities of shape {tuple(x.shape)}", tuple(u.shape))
         count = x.shape[0]
-        index = torch.arange(count) if robots is None else torch.as_tensor(list(robots), dtype=torch.long)
-        seen = torch.ones(count, dtype=torch.bool) if seen is None else seen
+        slot = torch.arange(count, device=x.device)
+        index = slot if robots is None else slot[list(robots)]
+        seen = torch.ones_like(slot, dtype=torch.bool) if seen is None else seen
 
         def for_each_robot(of_bodies: Tensor | None) -> Tensor | None:
             return None if of_bodies is None else of_bodies.to(torch.float64).expand(len(index), *of_bodies.shape)
@@ -105,7 +106,7 @@ class Measurement:
             x=x[index],
             u=own(u),
             bodies=bodies,
-            present=seen & (torch.arange(count) != index.unsqueeze(-1)),
+            present=seen & (slot != index.unsqueeze(-1)),
             body_velocities=for_each_robot(u),
             previous_body_velocities=for_each_robot(previous_u),
             radius=own(radius),

@@ -58,17 +58,16 @@ def nearest_bodies(
         raise InputError("u", f"velocities of shape {tuple(x.shape)}", tuple(u.shape))
     if count < 1 or not within > 0:
         raise InputError("count, within", "positive", (count, within))
-    places = x.detach().numpy()
+    places = x.detach().cpu().numpy()
     robot = np.arange(len(x)) if robots is None else np.asarray(robots, dtype=np.int64)
     # One more for the robot itself, one more for the nearest body without a slot; missing ones are infinitely far.
     distance, body = KDTree(places).query(places[robot], k=count + 2)
     distance[body == robot[:, None]] = -1.0  # the robot itself comes first, also where bodies share its place
     order = np.argsort(distance, axis=1, kind="stable")[:, 1:]
     distance, body = np.take_along_axis(distance, order, 1), np.take_along_axis(body, order, 1)
-    next_one = torch.from_numpy(distance[:, count])
-    present = torch.from_numpy(distance[:, :count] <= within) & torch.from_numpy(np.isfinite(distance[:, :count]))
-    slots = torch.from_numpy(np.where(present, body[:, :count], 0))
-    index = torch.from_numpy(robot)
+    there = (distance[:, :count] <= within) & np.isfinite(distance[:, :count])
+    arrays = (distance[:, count], there, np.where(there, body[:, :count], 0), robot)
+    next_one, present, slots, index = (torch.from_numpy(array).to(x.device) for array in arrays)
 
     def own(of_bodies: Tensor | None) -> Tensor | None:
         return None if of_bodies is None else of_bodies.to(torch.float64)[index]
@@ -77,7 +76,7 @@ def nearest_bodies(
         return None if of_bodies is None else of_bodies.to(torch.float64)[slots]
 
     def largest(of_bodies: Tensor | None) -> Float[Tensor, "robots"]:
-        size = torch.tensor(math.nan) if of_bodies is None else of_bodies.detach().to(torch.float64).max()
+        size = x.new_tensor(math.nan) if of_bodies is None else of_bodies.detach().to(torch.float64).max()
         return size.expand(len(index))
 
     bodies, left_out = of_slots(x), None

@@ -136,7 +136,7 @@ class SetMembershipObserver:
             expected = "None or False unless theta is planar, nothing is clipped and numba is installed"
             raise InputError("compiled", expected, True)
         self.prior = self.feasible_set
-        self.status = torch.zeros(self.feasible_set.batch_shape, dtype=torch.long)
+        self.status = torch.zeros_like(self.feasible_set.outcome)
         self.skipped = torch.zeros_like(self.status)
 
     def update(self, measurement: Measurement) -> SetEstimate:
@@ -171,7 +171,8 @@ class SetMembershipObserver:
         model = Model(
             safe_controls=Halfspaces.stack(parts),
             hard=torch.tensor(
-                [not b.soft for part, b in zip(parts, self.barriers, strict=True) for _ in range(part.rows)]
+                [not b.soft for part, b in zip(parts, self.barriers, strict=True) for _ in range(part.rows)],
+                device=u.device,
             ),
             C=C.to(torch.float64),
             d=d.to(torch.float64),

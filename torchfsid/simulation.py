@@ -115,12 +115,12 @@ def simulate(
     standing = torch.zeros(len(obstacles), n, dtype=torch.float64, device=start.device)
     x = torch.cat([start, obstacles]).to(torch.float64)
     u = torch.zeros_like(x)
-    t = dt * torch.arange(steps + 1, dtype=torch.float64)
+    t = dt * torch.arange(steps + 1, dtype=torch.float64, device=start.device)
     positions: list[Tensor] = []
     velocities: list[Tensor] = []
     controls: list[Control] = []
     for k in range(steps + 1):
-        control = controller(_seen(float(t[k]), x, None, u, robots, radius), theta)
+        control = controller(_seen(k * dt, x, None, u, robots, radius), theta)
         u = torch.cat([control.u, standing])
         positions.append(x)
         velocities.append(u)
