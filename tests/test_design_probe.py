@@ -15,14 +15,17 @@ from torch import Tensor
 from experiments.__main__ import main
 from experiments.design.config import ProbePlacementConfig, load_design
 from experiments.design.placement import place
-from experiments.design.probe import Probing, along, expectation
+from experiments.design.probe import Objective, Probing, along, expectation
 from experiments.design.rollout import closed_loop
+from experiments.design.switches import across, summarise_switches
 from experiments.design.tables import read_rows
 from torchfsid.barriers import ClassK, CollisionAvoidance
 from torchfsid.controller import CbfQpController
 from torchfsid.documents import dump
 from torchfsid.feasible_set import FeasibleSet
+from torchfsid.inverse_optimal import NoiseBound
 from torchfsid.observer import SetMembershipObserver
+from torchfsid.reading import SetKind
 from torchfsid.simulation import simulate
 from torchfsid.tasks import GoalTask
 
@@ -71,8 +74,9 @@ def test_whole_pipeline_against_finite_differences(kind: str):
     assert (jacobian.abs().amax(-1) > 1e-2).all()
 
 
-def test_simulate_and_the_observer_against_finite_differences():
-    """The same for the package's own `simulate`: obstacle -> Theta(T)."""
+@pytest.mark.parametrize("kind", ["critical_region", "inverse_optimal"])
+def test_simulate_and_the_observer_against_finite_differences(kind: SetKind):
+    """The same for the package's own `simulate`: obstacle -> closed loop -> log-area of Theta(T)."""
     task, barriers = GoalTask(1.0), [CollisionAvoidance(ClassK(1.0), 0.4)]
     standing, goal, start = tensor([[0.6, 0.7], [0.6, -0.7]]), tensor([[3.1, 0.2]]), tensor([[0.0, 0.0]])
 
@@ -80,7 +84,8 @@ def test_simulate_and_the_observer_against_finite_differences():
         bodies = torch.cat([standing, obstacle.unsqueeze(0)])
         run = simulate(CbfQpController(task, barriers), goal, start, dt=0.05, steps=12, obstacles=bodies)
         prior = FeasibleSet.from_box(tensor([[2.5, -0.5]]), tensor([[3.5, 0.5]]))
-        observer = SetMembershipObserver(task, barriers, prior, kind="critical_region")
+        noise = NoiseBound(0.01) if kind == "inverse_optimal" else None
+        observer = SetMembershipObserver(task, barriers, prior, kind=kind, noise=noise)
         for measurement in run.measurements():
             observer.update(measurement)
         return observer.feasible_set.volume().log().sum()
@@ -94,7 +99,7 @@ def test_simulate_and_the_observer_against_finite_differences():
 
 
 @pytest.mark.parametrize("objective", ["area", "log_area"])
-def test_score_term_where_the_mean_is_known(objective: str):
+def test_score_term_where_the_mean_is_known(objective: Objective):
     """Theta_0 = [0, 1] in two cells, [0, q] and [q, 1]: the mean of A is q^2 + (1 - q)^2, that of log A minus the
     entropy. Without the second term automatic differentiation gives half of the gradient, and nothing."""
     q = tensor(0.3).requires_grad_()
@@ -127,6 +132,19 @@ def test_gradient_of_the_mean_in_the_corridor(horizon: int):
         assert gradient.norm() / differences.norm() == pytest.approx(1.0, abs=0.05)
 
 
+def test_at_a_switch_the_area_jumps():
+    """Across the corridor for one goal: between switches the derivatives add up to the truth, and nowhere else."""
+    rows = across(Probing.of(load()), tensor([0.55, 0.0]), tensor([3.1, 0.2]))
+    y, log_area, added_up, switches = (np.array([row[key] for row in rows]) for key in rows[0])
+    jumps, switched = np.abs(np.diff(log_area) - np.diff(added_up)), np.diff(switches) > 0
+    assert (switches == 0).sum() > 100
+    assert jumps[switches[1:] == 0].max() < 1e-7
+    assert jumps[~switched].max() < 0.1 < jumps[switched].min()
+    assert jumps[switched].max() > 1
+    assert summarise_switches(rows)["switches"] == switches[-1] > 5
+    assert y[-1] - y[0] == pytest.approx(0.2)
+
+
 # What counts --------------------------------------------------------------------------------------------------------
 
 
@@ -142,6 +160,22 @@ def test_a_probe_that_comes_too_close_teaches_nothing():
     beside = probing.outcome(tensor([[[0.6, 0.0]]]), goals)
     assert beside.sound.all()
     assert (beside.area < probing.prior_area).all()
+
+
+def test_a_set_that_has_lost_its_goal_teaches_nothing():
+    """With a coarse tolerance, goals near a switch are given an active set that is not theirs."""
+    placement, lost = tensor([[[0.62, 0.05]]]), []
+    for tolerance in (1e-6, 0.05):
+        probing = Probing.of(load(f"active_tolerance={tolerance}"))
+        goals = probing.draw_goals(128, seed=0)
+        *_, last = probing.samples(placement, goals)
+        out = ~last.estimate.feasible_set.contains(goals, 1e-9)
+        outcome = probing.outcome(placement, goals)
+        assert torch.equal(outcome.sound[0], last.sound & ~out)
+        assert (outcome.area[0, out] == probing.prior_area).all()
+        lost.append(int((last.sound & out).sum()))
+    assert lost[0] == 0
+    assert lost[1] > 0
 
 
 def test_allowed_placements_keep_the_safety_distance_and_the_room():
@@ -202,7 +236,14 @@ def test_a_run_can_be_repeated_from_its_folder_and_is_drawn(tmp_path: Path):
     rows = [[{**row, "seconds": ""} for row in read_rows(folder / "runs.csv")] for folder in (first, second)]
     assert rows[0] == rows[1]
     assert len(rows[0]) == 7 + 6
-    for name in ("placements.json", "replay.json", "landscape.csv", "gradient_check.csv"):
+    for name in (
+        "placements.json",
+        "replay.json",
+        "landscape.csv",
+        "gradient_check.csv",
+        "no_gradient.csv",
+        "switches.csv",
+    ):
         assert (first / name).read_bytes() == (second / name).read_bytes()
     for name in ("figure.png", "figure.pdf", "comparison.png", "animation.gif"):
         assert (first / name).stat().st_size > 1000

@@ -3,18 +3,20 @@
 The same goals on both sides, so many that the jumps of single goals average out. Placements are drawn near the
 predicted path such that the probe matters, and that no difference steps across the safety distance: what is lost there
 is not seen by the gradient (docs/design.md).
+
+And where there is nothing to follow: the shares of placements from which the gradient is zero.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from experiments.design.config import ProbePlacementConfig
-from experiments.design.probe import Objective, Probing, expectation
+from experiments.design.probe import Objective, Probing, expectation, slope
 from experiments.design.search import Search
 from experiments.design.tables import Track
 
@@ -52,6 +54,27 @@ def check_gradients(config: ProbePlacementConfig, seed: np.random.SeedSequence, 
     return rows
 
 
+def nothing_to_follow(config: ProbePlacementConfig, seed: np.random.SeedSequence) -> list[dict[str, Any]]:
+    """A row per number of way-points and way of drawing: the share of placements from which the gradient is zero, and
+    the share of outcomes (a placement with a goal) that do not count."""
+    probing, rows = Probing.of(config), []
+    goals = probing.draw_goals(config.goals.train, int(seed.generate_state(1)[0]))
+    for K, child in zip(config.way_points, seed.spawn(len(config.way_points)), strict=True):
+        search = Search.of(probing, goals, K, child)
+        for drawn, draw in (("anywhere", search.anywhere), ("near_path", search.near_path)):
+            placements = draw(CANDIDATES * DRAWS)
+            zero, unsound = [], []
+            for part in placements.split(CANDIDATES):
+                leaf = part.requires_grad_()
+                outcome = probing.outcome(leaf, goals)
+                gradient = slope(expectation(outcome.area, "area").sum(), leaf)
+                zero.append((gradient == 0).flatten(1).all(-1))
+                unsound.append(~outcome.sound)
+            shares = {"zero": float(torch.cat(zero).double().mean()), "lost": float(torch.cat(unsound).double().mean())}
+            rows.append({"way_points": K, "drawn": drawn, **shares})
+    return rows
+
+
 def _fit_for_it(search: Search, horizon: int) -> Tensor:
     settings = search.probing.config.gradient_check
     fit: list[Tensor] = []
@@ -69,35 +92,52 @@ def _fit_for_it(search: Search, horizon: int) -> Tensor:
     return torch.cat(fit)[: settings.placements]
 
 
+class _Gradients(NamedTuple):
+    """Of the mean over goals: by automatic differentiation, that without the score term, by central differences."""
+
+    whole: Tensor
+    smooth_part: Tensor
+    differences: Tensor
+
+
 def _check(probing: Probing, placements: Tensor, goals: Tensor, horizon: int) -> list[dict[str, Any]]:
+    of_each = [_gradients(probing, placement.unsqueeze(0), goals, horizon) for placement in placements]
+    rows = []
+    for objective in OBJECTIVES:
+        together = _Gradients(*map(torch.cat, zip(*(of[objective] for of in of_each), strict=True)))
+        about = {"way_points": placements.shape[1], "objective": objective, "placements": len(placements)}
+        rows.append(about | _compare(together) | {"horizon": horizon})
+    return rows
+
+
+def _gradients(probing: Probing, placement: Tensor, goals: Tensor, horizon: int) -> dict[Objective, _Gradients]:
     step = probing.config.gradient_check.step
-    leaf = placements.clone().requires_grad_()
+    leaf = placement.clone().requires_grad_()
     area = probing.outcome(leaf, goals, horizon).area
-    differences: dict[Objective, Tensor] = {objective: torch.zeros_like(placements) for objective in OBJECTIVES}
-    for direction in _steps(placements, step):
+    differences: dict[Objective, Tensor] = {objective: torch.zeros_like(placement) for objective in OBJECTIVES}
+    for direction in _steps(placement, step):
         with torch.no_grad():
             ahead, behind = (probing.outcome(at, goals, horizon).area for at in (leaf + direction, leaf - direction))
             for objective, of in differences.items():
-                slope = (expectation(ahead, objective) - expectation(behind, objective)) / (2 * step)
-                of += slope[:, None, None] * direction / step
-    return [_compare(leaf, area, objective, of) | {"horizon": horizon} for objective, of in differences.items()]
+                of += (expectation(ahead, objective) - expectation(behind, objective)) / (2 * step) * direction / step
+    found = {}
+    for objective, of in differences.items():
+        phi = area if objective == "area" else area.log()
+        (whole,) = torch.autograd.grad(expectation(area, objective).sum(), leaf, retain_graph=True)
+        (smooth_part,) = torch.autograd.grad(phi.mean(), leaf, retain_graph=True)
+        found[objective] = _Gradients(whole, smooth_part, of)
+    return found
 
 
-def _compare(leaf: Tensor, area: Tensor, objective: Objective, differences: Tensor) -> dict[str, Any]:
-    (gradient,) = torch.autograd.grad(expectation(area, objective).sum(), leaf, retain_graph=True)
-    phi = area if objective == "area" else area.log()
-    (smooth_part,) = torch.autograd.grad(phi.mean(-1).sum(), leaf, retain_graph=True)
-    each = torch.cosine_similarity(gradient.flatten(1), differences.flatten(1))
+def _compare(of: _Gradients) -> dict[str, float]:
+    each = torch.cosine_similarity(of.whole.flatten(1), of.differences.flatten(1))
     return {
-        "way_points": leaf.shape[1],
-        "objective": objective,
-        "placements": len(leaf),
-        "cosine": _cosine(gradient, differences),
+        "cosine": _cosine(of.whole, of.differences),
         "median_cosine": float(each.median()),
         "least_cosine": float(each.min()),
-        "length_ratio": float(gradient.norm() / differences.norm()),
-        "cosine_without": _cosine(smooth_part, differences),
-        "length_ratio_without": float(smooth_part.norm() / differences.norm()),
+        "length_ratio": float(of.whole.norm() / of.differences.norm()),
+        "cosine_without": _cosine(of.smooth_part, of.differences),
+        "length_ratio_without": float(of.smooth_part.norm() / of.differences.norm()),
     }
 
 

@@ -38,7 +38,7 @@ def draw_learning(folder: Path, config: LearnedObserverConfig) -> Figure:
         for name, (colour, dashes) in OBSERVERS.items():
             rows = [row for row in curves if row["observer"] == name and float(row["noise"]) == noise]
             t, error = ([float(row[key]) for row in rows] for key in ("t", "error"))
-            axes.semilogy(t, error, color=colour, ls=dashes, lw=1.4, label=name)
+            axes.semilogy(t, error, color=colour, ls=dashes, lw=1.4, label=name.replace("ukf", "UKF"))
         axes.set(xlabel="t [s]", ylabel="mean error [m]" if i == 0 else "")
         axes.set_title(f"({'abcdef'[i]}) unseen teams, δ = {noise:g} m/s", fontweight="bold")
         axes.grid(True, which="both")
@@ -54,7 +54,7 @@ def draw_learning(folder: Path, config: LearnedObserverConfig) -> Figure:
     training.set(xlabel="epoch", ylabel="mean error [m]")
     training.set_title("(d) training (solid) and validation (dotted)", fontweight="bold")
     training.grid(True)
-    training.legend(fontsize=7)
+    training.legend(fontsize=7, loc="center right", bbox_to_anchor=(1, 0.38))
 
     pull = figure.add_subplot(grid[1, 3:])
     rows = read_rows(folder / "answers.csv")

@@ -8,6 +8,8 @@ A run leaves, beside the resolved config.yaml,
     landscape.csv        first corridor: the mean area over the validation goals for a still probe on a grid of places
     descent.csv          first corridor: where Adam's starts went
     gradient_check.csv   the gradient of the mean over goals against central differences
+    no_gradient.csv      shares of placements from which there is none to follow, and of outcomes that do not count
+    switches.csv         first corridor, one goal: its area and derivative as Adam's point is moved across the corridor
     replay.json          first corridor, one goal: what happens without a probe and with those that were chosen
     summary.json         means over corridors, and how many times smaller they are
 """
@@ -23,9 +25,10 @@ import torch
 from torch import Tensor
 
 from experiments.design.config import ProbePlacementConfig
-from experiments.design.gradient_check import check_gradients
+from experiments.design.gradient_check import check_gradients, nothing_to_follow
 from experiments.design.probe import Probing, along
 from experiments.design.search import METHODS, Evaluated, Search, choose
+from experiments.design.switches import across, summarise_switches
 from experiments.design.tables import Track, write_rows
 from torchfsid.documents import dump
 from torchfsid.results import write_json
@@ -38,7 +41,7 @@ def place(config: ProbePlacementConfig, out: Path, track: Track) -> dict[str, An
     """Search, compare, and write everything but the figures; returns the summary."""
     out.mkdir(parents=True, exist_ok=True)
     (out / "config.yaml").write_text(dump(config), encoding="utf-8")
-    checking, *seeds = np.random.SeedSequence(config.seed).spawn(1 + config.scenes)
+    checking, *seeds, drawing = np.random.SeedSequence(config.seed).spawn(2 + config.scenes)
     corridors = [_Corridor(config, seed) for seed in seeds]
     runs: list[dict[str, Any]] = []
     jobs = [(i, K, method) for i in range(len(corridors)) for K in config.way_points for method in _methods(K)]
@@ -50,10 +53,16 @@ def place(config: ProbePlacementConfig, out: Path, track: Track) -> dict[str, An
     first = corridors[0]
     write_rows(out / "landscape.csv", first.landscape(track))
     write_rows(out / "descent.csv", first.descent)
-    write_json(out / "replay.json", first.replay())
+    replay = first.replay()
+    write_json(out / "replay.json", replay)
+    switches = across(first.probing, first.chosen[1]["adam"][0, 0], torch.tensor(replay["goal"], dtype=torch.float64))
+    write_rows(out / "switches.csv", switches)
     checks = check_gradients(config, checking, track)
     write_rows(out / "gradient_check.csv", checks)
+    nothing = nothing_to_follow(config, drawing)
+    write_rows(out / "no_gradient.csv", nothing)
     summary = {"title": config.title, "seed": config.seed, "set": config.set} | summarise(runs, checks)
+    summary |= {"no gradient": nothing, "where active sets switch": summarise_switches(switches)}
     write_json(out / "summary.json", summary)
     return summary
 
@@ -175,11 +184,12 @@ def _grid(probing: Probing, columns: int, rows: int) -> Tensor:
 
 
 def _descent(found: Evaluated) -> list[dict[str, Any]]:
-    batches = zip(found.placements[found.screened :], found.means[found.screened :], strict=True)
+    screened = len(found.means) - len(found.starts)
+    batches = zip(found.starts, found.placements[screened:], found.means[screened:], strict=True)
     return [
         {"step": step, "start": i, "x": x, "y": y, "mean_area": mean}
-        for step, (placements, means) in enumerate(batches)
-        for i, (((x, y),), mean) in enumerate(zip(placements.tolist(), means.tolist(), strict=True))
+        for step, (starts, placements, means) in enumerate(batches)
+        for i, ((x, y),), mean in zip(starts.tolist(), placements.tolist(), means.tolist(), strict=True)
     ]
 
 

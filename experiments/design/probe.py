@@ -22,10 +22,12 @@ a change of the probabilities contributes. Automatic differentiation of
 gives both. Without it mean(grad log A) = grad (sum_i A_i)/A_0 = 0: exactly nothing; and for phi = A, since
 A grad log A = grad A, exactly half of the gradient. The condition holds for critical regions at the first sample, and
 for as long as the motion does not depend on the goal (G = 0). Goals whose motion differs cut the set differently; then
-L is an approximation (docs/design.md measures it).
+L is an approximation (docs/design.md measures it). A tolerance of the active set breaks the condition too: the goals
+within it of a switch are given an active set that is not theirs, and with it a small set that need not hold them.
 
 Nothing is learned (A = A_0, and no gradient) from a goal for which a QP has no solution, an intersection is empty, an
-alarm is raised, or the probe comes closer to the robot than the safety distance: an optimiser would use them.
+alarm is raised, the probe comes closer to the robot than the safety distance, or Theta(T) has lost the goal: an
+optimiser would use them.
 """
 
 from __future__ import annotations
@@ -49,7 +51,7 @@ from torchfsid.tasks import GoalTask
 Objective = Literal["area", "log_area"]
 
 TOUCHING = 1e-9
-"""Round-off allowed in the distance between probe and robot [m]."""
+"""Round-off allowed in the distance between probe and robot, and of a goal from its set [m]."""
 
 
 class Sample(NamedTuple):
@@ -164,8 +166,10 @@ class Probing:
         """What every placement comes to with every goal, after all samples or the first `steps`."""
         for sample in self.samples(placements, goals, steps):
             last = sample
-        area = torch.where(last.sound, last.estimate.feasible_set.volume(), self.prior_area)
-        return Outcome(area.reshape(-1, len(goals)), last.sound.reshape(-1, len(goals)))
+        theta_set = last.estimate.feasible_set
+        sound = last.sound & theta_set.contains(goals.repeat(len(last.sound) // len(goals), 1), TOUCHING)
+        area = torch.where(sound, theta_set.volume(), self.prior_area)
+        return Outcome(area.reshape(-1, len(goals)), sound.reshape(-1, len(goals)))
 
 
 def along(placements: Float[Tensor, "P K 2"], fraction: float) -> Float[Tensor, "P 2"]:
@@ -183,6 +187,11 @@ def expectation(area: Float[Tensor, "P S"], objective: Objective) -> Float[Tenso
     phi = area if objective == "area" else log_area
     weight = (phi - phi.mean(-1, keepdim=True)).detach()
     return phi.mean(-1) + (weight * (log_area - log_area.detach())).mean(-1)
+
+
+def slope(value: Float[Tensor, ""], placements: Float[Tensor, "P K 2"]) -> Float[Tensor, "P K 2"]:
+    """The gradient of a sum over placements: zero also where none of them changes anything."""
+    return torch.autograd.grad(value, placements)[0] if value.requires_grad else torch.zeros_like(placements)
 
 
 def _box(box: BoxConfig) -> tuple[Tensor, Tensor]:

@@ -1,8 +1,9 @@
-"""Probe placement in two figures: the search (landscape, methods, gradients), and what a probe changes."""
+"""Probe placement in two figures: the search (landscape, methods, gradients, switches), and what a probe changes."""
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +23,13 @@ SEEN = 0.95
 """The map shows the places from which a probe brings the area below this share of the largest, and the robot."""
 
 TICKS = [digit * 10.0**power for power in range(-6, 3) for digit in (1, 2, 3, 5, 7)]
+LETTERS = "abcdefghijkl"
 METHODS = {
     "none": ("no probe", "0.4"),
     "one_random": ("one at random", "0.4"),
-    "random": ("best of as many, random", HYBRID),
-    "grid": ("best of as many, grid", "#56B4E9"),
-    "near_path": ("best of as many, near the path", "#7F5539"),
+    "random": ("best at random", HYBRID),
+    "grid": ("best on a grid", "#56B4E9"),
+    "near_path": ("best near the path", "#7F5539"),
     "cem": ("cross-entropy method", UKF),
     "adam": ("Adam", REGION),
 }
@@ -35,11 +37,12 @@ METHODS = {
 
 
 def draw_search(folder: Path, config: ProbePlacementConfig) -> Figure:
-    figure = Figure(figsize=(11.5, 5.6), layout="constrained")
-    grid = figure.add_gridspec(2, 2, height_ratios=(1.35, 1), width_ratios=(1.25, 1))
-    _landscape(figure.add_subplot(grid[0, 0]), folder, config)
-    _methods(figure.add_subplot(grid[:, 1]), folder, config)
+    figure = Figure(figsize=(11.5, 6.0), layout="constrained")
+    grid = figure.add_gridspec(2, 3, height_ratios=(1.2, 1), width_ratios=(1, 1, 1.7))
+    _landscape(figure.add_subplot(grid[0, :2]), folder, config)
+    _methods(figure.add_subplot(grid[:, 2]), folder, config)
     _cosines(figure.add_subplot(grid[1, 0]), folder)
+    _switches(figure.add_subplot(grid[1, 1]), folder)
     figure.suptitle(f"{config.title}: {config.scenes} corridors, held-out goals", fontsize=9, x=0.01, ha="left")
     return figure
 
@@ -64,28 +67,31 @@ def _landscape(axes: Axes, folder: Path, config: ProbePlacementConfig) -> None:
     _corridor(axes, first["obstacles"], config)
     start_x, start_y = config.start
     axes.add_patch(Circle((start_x, start_y), config.safety_distance, fc="none", ec="black", ls=":", lw=1))
-    for path in _ways(read_rows(folder / "descent.csv")):
-        axes.plot(*path.T, color="white", lw=0.7, alpha=0.8)
-        axes.plot(*path[0], "o", color="white", ms=2.4)
+    for way in _ways(read_rows(folder / "descent.csv")):
+        found = (way == first["chosen"]["1"]["adam"][0]).all(-1).any()
+        axes.plot(*way.T, color="white", lw=1.8 if found else 0.5, alpha=1.0 if found else 0.6, zorder=3 + found)
+        axes.plot(*way[0], "o", color="white", ms=5.0 if found else 2.4, mec="black", mew=0.4, zorder=3 + found)
     for name, marker in (("random", "s"), ("grid", "D"), ("cem", "P"), ("adam", "*")):
         x, y = first["chosen"]["1"][name][0]
         label, colour = METHODS[name]
-        axes.plot(x, y, marker, color=colour, ms=12 if name == "adam" else 7, mec="black", mew=0.8, label=label, ls="")
+        size = 12 if name == "adam" else 7
+        axes.plot(x, y, marker, color=colour, ms=size, mec="black", mew=0.8, label=label, ls="", zorder=6)
     places = np.array([(float(row["x"]), float(row["y"])) for row in rows])
-    matter = np.nan_to_num(mean.ravel(), nan=0.0) < (SEEN * high if low < SEEN * high else np.inf)
-    left, bottom = np.maximum(places[matter].min(0) - 0.1, config.room.lower)
-    right, top = np.minimum(places[matter].max(0) + 0.1, config.room.upper)
+    matter = mean.ravel() < (SEEN * high if low < SEEN * high else np.inf)
+    seen = np.vstack([places[matter], np.array([config.start]) - config.safety_distance / 2])
+    left, bottom = np.maximum(seen.min(0) - 0.05, config.room.lower)
+    right, top = np.minimum(seen.max(0) + 0.05, config.room.upper)
     axes.set(xlabel="x of a probe that stands still [m]", ylabel="y [m]", xlim=(left, right), ylim=(bottom, top))
     axes.set_title("(a) the area a still probe leaves; white: Adam's ways", fontweight="bold")
-    axes.legend(loc="upper right", frameon=True, framealpha=0.85, edgecolor="none", fontsize=7)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=4, fontsize=7, columnspacing=1.2)
 
 
 def _ways(rows: list[dict[str, str]]) -> list[np.ndarray]:
-    """One array of places per start. Half-way fewer go on, under new numbers: they begin new ways."""
-    together = Counter(row["step"] for row in rows)
-    ways: dict[tuple[int, str], list[tuple[float, float]]] = defaultdict(list)
+    """The places on the way down from each start. A start that goes on from one stage to the next does so from the best
+    of its places."""
+    ways: dict[str, list[tuple[float, float]]] = defaultdict(list)
     for row in rows:
-        ways[together[row["step"]], row["start"]].append((float(row["x"]), float(row["y"])))
+        ways[row["start"]].append((float(row["x"]), float(row["y"])))
     return [np.array(way) for way in ways.values()]
 
 
@@ -117,6 +123,7 @@ def _methods(axes: Axes, folder: Path, config: ProbePlacementConfig) -> None:
     axes.set(
         yticks=ticks, yticklabels=labels, xscale="log", xlabel="mean area left [m²]; a dot per corridor, bar: mean"
     )
+    axes.xaxis.set_major_formatter("{x:g}")
     axes.set_ylim(min(ticks) - 0.6, 0.6)
     axes.grid(True, axis="x")
     number = config.search.starts * config.search.steps
@@ -130,15 +137,32 @@ def _cosines(axes: Axes, folder: Path) -> None:
             of = [row for row in rows if row["objective"] == objective and row["way_points"] == K]
             horizon = [int(row["horizon"]) for row in of]
             name = {"area": "A", "log_area": "log A"}[objective]
-            for column, dashes, which in (("cosine", "-", "with"), ("cosine_without", ":", "without")):
-                label = f"{name}, {which} score" if marker == "o" else None
+            for column, dashes, which in (("cosine", "-", ""), ("cosine_without", ":", ", no score")):
+                label = f"{name}{which}" if marker == "o" else None
                 values = [float(row[column]) for row in of]
                 axes.plot(horizon, values, dashes, color=colour, marker=marker, ms=4, lw=1.3, label=label)
     axes.axhline(0.95, color="0.6", lw=0.6)
-    axes.set(xlabel="samples", ylabel="cosine", ylim=(-1.05, 1.05))
-    axes.set_title("(c) gradient of the mean over goals against differences", fontweight="bold")
+    axes.set(xlabel="samples", ylabel="cosine", ylim=(-1.9, 1.05), yticks=(-1, -0.5, 0, 0.5, 1))
+    axes.set_title("(c) gradient against differences", fontweight="bold")
     axes.grid(True)
-    axes.legend(fontsize=7, title="circles: still, squares: path", title_fontsize=7, loc="center right")
+    axes.legend(fontsize=6, title="circles: still, squares: path", title_fontsize=6, loc="lower right", ncols=2)
+
+
+def _switches(axes: Axes, folder: Path) -> None:
+    rows = read_rows(folder / "switches.csv")
+    y, log_area, by_derivatives = (
+        np.array([float(row[key]) for row in rows]) for key in ("y", "log_area", "by_derivatives")
+    )
+    history = np.array([int(row["switches"]) for row in rows])
+    for i in range(history[-1] + 1):
+        axes.plot(y[history == i], log_area[history == i], "-", color=REGION, lw=1.6, label=None if i else "log A")
+    axes.plot(y, by_derivatives, ":", color=UKF, lw=1.4, label="its derivatives, added up")
+    axes.set(xlabel="y of a still probe [m]", ylabel="log of the area left")
+    axes.set_title(f"(d) one goal: {history[-1]} switches", fontweight="bold")
+    axes.grid(True)
+    bottom, top = axes.get_ylim()
+    axes.set_ylim(bottom - 0.25 * (top - bottom), top)
+    axes.legend(fontsize=6, loc="lower center", ncols=2)
 
 
 def draw_before_after(folder: Path, config: ProbePlacementConfig) -> Figure:
@@ -146,12 +170,13 @@ def draw_before_after(folder: Path, config: ProbePlacementConfig) -> Figure:
     runs: list[dict[str, Any]] = replay["runs"]
     figure = Figure(figsize=(11.5, 4.6), layout="constrained")
     grid = figure.subplots(2, 1 + (len(runs) - 1 + 1) // 2, squeeze=False)
-    cells = [grid[0, 0], *grid[0, 1:], *grid[1, 1:]]
+    cells, curves = [grid[0, 0], *grid[0, 1:], *grid[1, 1:]], grid[1, 0]
+    columns = grid.shape[1]
     order = [runs[0], *_by_way_points(runs[1:])]
-    for letter, axes, run in zip("abcdefgh", cells, order, strict=False):
+    letters = [*LETTERS[:columns], *LETTERS[columns + 1 :]]
+    for letter, axes, run in zip(letters, cells, order, strict=False):
         draw_map(axes, replay, run, config, len(run["samples"]) - 1)
         axes.set_title(f"({letter}) {name_of(run)}: {run['samples'][-1]['area']:.3g} m²", fontweight="bold")
-    curves = grid[1, 0]
     for run in order:
         t = [sample["t"] for sample in run["samples"]]
         colour = METHODS[run["method"]][1]
@@ -159,7 +184,7 @@ def draw_before_after(folder: Path, config: ProbePlacementConfig) -> Figure:
         areas = [sample["area"] for sample in run["samples"]]
         curves.semilogy(t, areas, color=colour, ls=dashes, lw=1.5, label=name_of(run))
     curves.set(xlabel="t [s]", ylabel="area of Θ(t) [m²]")
-    curves.set_title("(f) over time", fontweight="bold")
+    curves.set_title(f"({LETTERS[columns]}) over time", fontweight="bold")
     curves.grid(True)
     curves.set_ylim(bottom=curves.get_ylim()[0] / 8)
     curves.legend(fontsize=7, loc="lower left")
@@ -197,9 +222,13 @@ def draw_map(axes: Axes, replay: dict[str, Any], run: dict[str, Any], config: Pr
             Circle((x, y), radius, fc=face, ec="black" if i in active else "0.55", lw=1.6 if i in active else 0.6)
         )
     if run["way_point_places"]:
-        axes.plot(*np.array(run["way_point_places"]).T, "-", color=PROBE, lw=0.8, marker=".", ms=4, zorder=6)
+        way = np.array(run["way_point_places"])
+        axes.plot(*way.T, "-", color=PROBE, lw=0.8, marker=".", ms=4, zorder=6)
+        for tail, head in pairwise(way):
+            axes.annotate("", (tail + head) / 2, tail, arrowprops={"arrowstyle": "->", "color": PROBE}, zorder=6)
     axes.plot(*np.array([s["x"] for s in run["samples"][: k + 1]]).T, color=ROBOT, lw=1.2, zorder=6)
     add_robot(axes, sample["x"], radius, ROBOT)
     add_goal(axes, replay["goal"])
     (left, bottom), (right, top) = config.room.lower, config.room.upper
     axes.set(xlim=(left - 0.1, max(right, upper[0]) + 0.1), ylim=(bottom, top), aspect="equal")
+    axes.set(xlabel="x [m]", ylabel="y [m]")

@@ -29,12 +29,12 @@ def print_design(summary: dict[str, Any], console: Console) -> None:
         _print(console, "Gradient of the mean over goals against central differences", "", cosines)
     else:
         for noise, observers in summary["mean errors by noise [m]"].items():
-            _print(console, f"Mean error [m] on unseen teams, disturbance up to {noise} m/s", "observer", observers)
+            _print(console, f"Mean error in m on unseen teams, disturbance up to {noise} m/s", "observer", observers)
 
 
 def _print(console: Console, title: str, first: str, rows: dict[str, dict[str, float]]) -> None:
     table = Table(title=title, box=SIMPLE_HEAD, title_justify="left")
-    table.add_column(first)
+    table.add_column(first, no_wrap=True)
     for name in next(iter(rows.values()), {}):
         table.add_column(name, justify="right")
     for name, row in rows.items():

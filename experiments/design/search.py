@@ -8,17 +8,18 @@ that no method has seen.
     random        the best of as many places drawn from the room
     near_path     the best of as many places drawn near the path predicted without a probe
     cem           the cross-entropy method: generations from a Gaussian fitted to the best of the generation before
-    adam          Adam from the best of many starts near the predicted path, projected onto the allowed placements
+    adam          Adam by successive halving, from many starts near the predicted path, projected onto the allowed
+                  placements
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from experiments.design.probe import Probing, expectation
@@ -26,18 +27,21 @@ from experiments.design.probe import Probing, expectation
 COARSEST = 1e-3
 """The Gaussian of the cross-entropy method keeps at least this standard deviation [m]."""
 
+HALVINGS = 3
+"""Stages of Adam's search, each from half as many placements as the one before."""
+
 TURN = 1.0
 """Standard deviation of the way from one way-point to the next around the robot [rad]."""
 
 
 @dataclass
 class Evaluated:
-    """Placements in the order of their evaluation, and their mean areas over the training goals [m^2]; the first
-    `screened` batches only chose where to start from."""
+    """Placements in the order of their evaluation, and their mean areas over the training goals [m^2]. Batches on ways
+    down are the last; `starts` numbers where each of their placements comes from."""
 
     placements: list[Float[Tensor, "P K 2"]] = field(default_factory=list)
     means: list[Float[Tensor, "P"]] = field(default_factory=list)
-    screened: int = 0
+    starts: list[Int[Tensor, "P"]] = field(default_factory=list)
 
     def add(self, placements: Float[Tensor, "P K 2"], areas: Float[Tensor, "P S"]) -> Float[Tensor, "P"]:
         self.placements.append(placements.detach().clone())
@@ -121,29 +125,38 @@ def cem(search: Search) -> Evaluated:
 
 
 def adam(search: Search) -> Evaluated:
-    """Adam from the best of many starts, all at a time, its steps falling to zero; after each, the nearest allowed
-    placements. From most starts there is no way down: there the probe changes nothing, or comes too close. So a fifth
-    of the simulations chooses starts, two fifths go on from the best `starts`/2, and two from the best half of these.
-    """
+    """Adam, all placements at a time; after each step the nearest allowed ones. From most starts there is no way down:
+    there the probe changes nothing, or comes too close. So a fifth of the simulations chooses starts, and the others
+    go in equal shares to the best `starts`/2, the best half of these, and the best half again (successive halving; K.
+    Jamieson, A. Talwalkar, 2016): the fewer they are, the more steps each has. The learning rate falls to zero."""
     found, settings = Evaluated(), search.probing.config.search
     for _ in range(max(settings.steps // 5, 1)):
         placements = search.near_path(settings.starts)
         found.add(placements, search.evaluate(placements))
-    found.screened = len(found.means)
     placements, means = torch.cat(found.placements), torch.cat(found.means)
-    left, rate = settings.starts * settings.steps - len(means), settings.learning_rate
-    for kept, rates in ((settings.starts // 2, (rate, rate / 2)), (max(settings.starts // 4, 1), (rate / 2, 0.0))):
-        best = means.argsort()[:kept]
-        placements, means = _descend(search, found, placements[best], left // 2 // kept, rates)
+    starts = torch.arange(len(means))
+    left = settings.starts * settings.steps - len(means)
+    for stage in range(HALVINGS):
+        best = means.argsort()[: max(settings.starts >> (stage + 1), 1)]
+        steps = left // (HALVINGS - stage) // len(best)
+        starts = starts[best]
+        rates = [settings.learning_rate * (1 - done / HALVINGS) for done in (stage, stage + 1)]
+        placements, means = _descend(search, found, placements[best], means[best], steps, rates)
+        found.starts += [starts] * steps
+        left -= steps * len(best)
     return found
 
 
 def _descend(
-    search: Search, found: Evaluated, placements: Float[Tensor, "P K 2"], steps: int, rates: tuple[float, float]
+    search: Search,
+    found: Evaluated,
+    best: Float[Tensor, "P K 2"],
+    lowest: Float[Tensor, "P"],
+    steps: int,
+    rates: Sequence[float],
 ) -> tuple[Float[Tensor, "P K 2"], Float[Tensor, "P"]]:
     """The best placement on the way from each, and its mean area; the learning rate goes from one to the other."""
-    best, lowest = placements, placements.new_full((len(placements),), torch.inf)
-    placements = placements.clone().requires_grad_()
+    placements = best.clone().requires_grad_()
     optimiser = torch.optim.Adam([placements])
     for k in range(steps):
         optimiser.param_groups[0]["lr"] = rates[0] + (rates[1] - rates[0]) * k / steps
