@@ -3,8 +3,8 @@
 The whole observer update (rows from positions, active set, KKT conditions, half-spaces, clipping) for fleets of 1 to
 100 000 robots with 8 neighbours each (`scenario`), from the prior on: robot-updates per second of CPU time on one
 thread; ten fleets of 1000, so that each size has its share of robots. The search of the neighbours, which the observer
-does not do, is given beside it. Then one robot, update by update, and a fleet over many steps, whose cost must not
-grow.
+does not do, is given beside it. Then the same robots observed among more or fewer neighbours, one robot, update by
+update, and a fleet over many steps, whose cost must not grow.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from benchmarks.scenario import NEIGHBOURS, Fleet, measured, observer
 from torchfsid.compiled import installed
 
 SIZES, LEAST, BLOCK = (1_000, 10_000, 100_000), 10_000, 10
+CROWDS = (4, 8, 16, 32)
 
 
 def _blocks(fleet: Fleet, steps: int) -> Iterator[list[tuple[float, Tensor, Tensor]]]:
@@ -33,7 +34,7 @@ def _blocks(fleet: Fleet, steps: int) -> Iterator[list[tuple[float, Tensor, Tens
         yield block
 
 
-def run(robots: int, steps: int, noisy: bool, compiled: bool, fleets: int = 1) -> dict:
+def run(robots: int, steps: int, noisy: bool, compiled: bool, fleets: int = 1, neighbours: int = NEIGHBOURS) -> dict:
     """Some fleets from the prior on, one after the other; times per robot and update [us]."""
     spent, search, cut, used, active, lost = [], 0.0, 0, 0, 0, 0
     for seed in range(fleets):
@@ -41,7 +42,7 @@ def run(robots: int, steps: int, noisy: bool, compiled: bool, fleets: int = 1) -
         watching = observer(fleet.prior(), compiled)
         for moments in _blocks(fleet, steps):
             began = time.process_time()
-            block = [measured(*moment) for moment in moments]
+            block = [measured(*moment, neighbours=neighbours) for moment in moments]
             search += time.process_time() - began
             for measurement in block:
                 began = time.process_time()
@@ -55,6 +56,7 @@ def run(robots: int, steps: int, noisy: bool, compiled: bool, fleets: int = 1) -
     late = np.array(spent).reshape(fleets, steps)[:, -steps // 4 :]
     return {
         "robots": robots,
+        "neighbours": neighbours,
         "fleets": fleets,
         "steps": steps,
         "noisy": noisy,
@@ -114,8 +116,9 @@ def main(arguments: list[str]) -> None:
         run(1000, 2, True, compiled)  # compile, and load what loads late
         sizes = [(robots, noisy) for noisy in (False, True) for robots in SIZES if robots <= options.largest]
         rows = [run(B, options.steps, noisy, compiled, max(1, LEAST // B)) for B, noisy in sizes]
+        crowds = [run(1000, options.steps, True, compiled, neighbours=M) for M in CROWDS]
         alone, long = run_alone(2000, compiled), run_long(200, options.long, compiled)
-        results[way] = {"fleets": rows, "alone": alone, "long": long}
+        results[way] = {"fleets": rows, "crowds": crowds, "alone": alone, "long": long}
         print(f"\n{way}")
         for row in rows:
             print(
@@ -126,6 +129,7 @@ def main(arguments: list[str]) -> None:
                 f"truths lost {row['truths_lost']}; {row['set_bytes_per_robot']:.0f} bytes; "
                 f"neighbours {row['search_microseconds']:.2f} us"
             )
+        print("  B = 1000, noisy: " + ", ".join(f"M = {c['neighbours']}: {c['microseconds']:.2f} us" for c in crowds))
         print(f"  B = 1: median {alone['median']:.0f} us, 90 % below {alone['p90']:.0f} us")
         along, slots = ", ".join(f"{cost:.2f}" for cost in long["microseconds"]), long["slots"]
         print(f"  {long['steps']} steps of {long['robots']} robots: {along} us; slots {slots[0]}..{slots[-1]}")

@@ -91,6 +91,8 @@ def fleet(found: dict[str, Any]) -> str:
         ]
         parts.append(table([*head, "neighbours µs"], body))
         parts.append(f"One robot: median {alone['median']:.0f} µs, 90 % below {alone['p90']:.0f} µs (wall clock).\n")
+        crowds = ", ".join(f"{row['neighbours']}: {number(row['microseconds'])} µs" for row in found[way]["crowds"])
+        parts.append(f"{found[way]['crowds'][0]['robots']} noisy robots among M neighbours, M = {crowds}.\n")
         along = ", ".join(number(cost) for cost in long["microseconds"])
         parts.append(
             f"{long['steps']} noisy updates of {long['robots']} robots, in ten pieces: {along} µs each; slots of the "

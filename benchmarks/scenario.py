@@ -82,5 +82,5 @@ def observer(prior: FeasibleSet, compiled: bool) -> SetMembershipObserver:
     return SetMembershipObserver(TASK, [BARRIER], prior, noise=NoiseBound(ERROR), compiled=compiled)
 
 
-def measured(t: float, x: Tensor, u: Tensor, robots: range | None = None) -> Measurement:
-    return nearest_bodies(t, x, u, count=NEIGHBOURS, robots=robots)
+def measured(t: float, x: Tensor, u: Tensor, robots: range | None = None, neighbours: int = NEIGHBOURS) -> Measurement:
+    return nearest_bodies(t, x, u, count=neighbours, robots=robots)
