@@ -278,7 +278,6 @@ def main(arguments: list[str]) -> None:
         show(console, problem, block)
         results += block
     packages = ["torch", "numpy", "cvxpy", "cvxpylayers", "diffcp", "scs"]
-    if active_rows.installed():
-        packages.append("numba")
+    packages += [package for package in ("moreau", "numba") if find_spec(package)]
     where = save("layers", {"cores": os.cpu_count(), "measured": [asdict(r) for r in results]}, packages)
     print(f"saved: {where}")

@@ -121,12 +121,18 @@ def observer(found: dict[str, Any]) -> str:
 def layers(found: dict[str, Any]) -> str:
     parts = [
         "## layers: projection and Chebyshev centre with gradients\n",
-        "Times of one forward and one backward pass of the whole batch. Errors: the largest distance from the same",
-        "problem in rationals, of the answers and of the gradients.\n",
+        "One forward and one backward pass of a batch of B problems with m rows in the plane; ratios to the first one.",
+        "Errors: the largest distance from the same problem in rationals, of the answers and of the gradients.\n",
     ]
+    head = ["solver", "B", "m", "ms", "ratio", "error", "gradient error"]
     for problem, rows in groupby(found["measured"], key=lambda row: row["problem"]):
-        body = [[value if isinstance(value, str | int) else number(value) for value in row.values()] for row in rows]
-        head = [key.replace("_", " ") for key in found["measured"][0]]
+        body = []
+        for (B, m), block in groupby(rows, key=lambda row: (row["batch"], row["rows"])):
+            block = list(block)
+            for row in block:
+                ratio = block[0]["seconds"] / row["seconds"]
+                errors = f"{row['error']:.0e}", f"{row['gradient_error']:.0e}"
+                body.append([row["solver"], B, m, number(1e3 * row["seconds"]), number(ratio), *errors])
         parts += [f"**{problem}**\n", table(head, body)]
     return "\n".join(parts)
 
