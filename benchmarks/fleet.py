@@ -116,7 +116,7 @@ def main(arguments: list[str]) -> None:
         run(1000, 2, True, compiled)  # compile, and load what loads late
         sizes = [(robots, noisy) for noisy in (False, True) for robots in SIZES if robots <= options.largest]
         rows = [run(B, options.steps, noisy, compiled, max(1, LEAST // B)) for B, noisy in sizes]
-        crowds = [run(1000, options.steps, True, compiled, neighbours=M) for M in CROWDS]
+        crowds = [run(1000, options.steps, True, compiled, LEAST // 1000, M) for M in CROWDS]
         alone, long = run_alone(2000, compiled), run_long(200, options.long, compiled)
         results[way] = {"fleets": rows, "crowds": crowds, "alone": alone, "long": long}
         print(f"\n{way}")
