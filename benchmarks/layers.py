@@ -54,10 +54,12 @@ class Measured:
 
 
 def workload(m: int, B: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Unit rows A, offsets b in [0.5, 1.5] and points y, most of them outside."""
+    """Unit rows A, the first three 120 degrees apart, so that no set is unbounded, at which cvxpylayers fails for the
+    whole batch; offsets b in [0.5, 1.5] and points y, most of them outside."""
     rng = np.random.default_rng(m)
-    A = rng.normal(size=(B, m, 2))
-    A /= np.linalg.norm(A, axis=-1, keepdims=True)
+    angle = rng.uniform(0, 2 * np.pi, (B, m))
+    angle[:, :3] = angle[:, :1] + np.arange(3) * 2 * np.pi / 3
+    A = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     drawn = A, rng.uniform(0.5, 1.5, size=(B, m)), 3 * rng.normal(size=(B, 2))
     return tuple(torch.from_numpy(part).requires_grad_() for part in drawn)  # type: ignore[return-value]
 

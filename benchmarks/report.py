@@ -104,16 +104,18 @@ def fleet(found: dict[str, Any]) -> str:
 
 def observer(found: dict[str, Any]) -> str:
     body = []
-    for robots, rows in found["fleets"].items():
+    for robots, rows in found["sizes"].items():
         reference = rows["UKF (filterpy)"]["microseconds"]
         for name, what in rows.items():
             ratio = number(reference / what["microseconds"])
-            body.append([f"{name}, B = {robots}", number(what["microseconds"]), ratio, f"{what['mean_error']:.4f}"])
+            errors = f"{what['median_error']:.4f}", f"{what['mean_error']:.4f}"
+            body.append([f"{name}, B = {robots}", number(what["microseconds"]), ratio, *errors])
     return "\n".join(
         [
             "## observer: one update of each observer\n",
-            f"The same noisy measurements for all, {found['steps']} of them; wall-clock time per robot and update.\n",
-            table(["", "µs", "× the UKF", "mean error at the end [m]"], body),
+            f"The same noisy measurements for all, {found['fleets']} fleets and {found['updates']} updates; wall-clock",
+            "time per robot and update, errors at the end.\n",
+            table(["", "µs", "× the UKF", "median error [m]", "mean error [m]"], body),
         ]
     )
 
