@@ -161,3 +161,34 @@ def test_wrong_halfspaces_are_refused() -> None:
         theta.intersect(Halfspaces(torch.tensor([[1.0, float("nan")]]), torch.ones(1)))
     with pytest.raises(InputError, match="metric"):
         theta.project(torch.zeros(3, 2), torch.ones(3, 3))
+
+
+@pytest.mark.parametrize("p", [1, 2, 3])
+def test_a_batch_of_none(p: int) -> None:
+    none = FeasibleSet.from_box(-torch.ones(0, p), torch.ones(0, p))
+    chosen = FeasibleSet.from_box(-torch.ones(2, p), torch.ones(2, p)).select(torch.zeros(0, dtype=torch.long))
+    for sets in (none, chosen):
+        after = sets.intersect(Halfspaces(torch.ones(0, 1, p), torch.ones(0, 1)), compiled=False)
+        assert after.facets().halfspaces.b.shape[0] == 0
+        assert after.contains(torch.zeros(0, p)).shape == after.diameter().shape == after.volume().shape == (0,)
+        assert after.centroid().shape == after.chebyshev()[0].shape == (0, p)
+
+
+@pytest.mark.parametrize("p", [2, 3])
+def test_a_tie_is_decided_alike_in_every_batch(p: int) -> None:
+    """Two vertices are extreme; a neighbour with more vertices changes the padding, not the derivatives."""
+
+    def slopes(batch: int) -> list[torch.Tensor]:
+        direction = -torch.eye(p, dtype=torch.float64)[0].repeat(batch, 1).requires_grad_()
+        b = torch.full((batch, 2), 0.5, dtype=torch.float64)
+        b[0] = 9.0
+        b.requires_grad_()
+        A = torch.zeros(batch, 2, p, dtype=torch.float64)
+        A[:, :, 0], A[:, 0, 1], A[:, 1, 1] = 1.0, 1.0, -1.0
+        upper = torch.ones(batch, p, dtype=torch.float64, requires_grad=True)
+        sets = FeasibleSet.from_box(-upper, upper).intersect(Halfspaces(A, b))
+        asked = sets.support(direction)[0] + sets.diameter()[0]
+        return [slope[0] for slope in torch.autograd.grad(asked, (direction, upper))]
+
+    for alone, together in zip(slopes(1), slopes(2), strict=True):
+        torch.testing.assert_close(alone, together)

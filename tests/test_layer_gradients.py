@@ -250,3 +250,44 @@ def test_compiled_first_derivatives_are_those_of_the_graph(p):
             assert (mine is None) == (theirs is None)
             if mine is not None:
                 torch.testing.assert_close(mine, theirs, atol=1e-10, rtol=1e-9)
+
+
+def test_a_trained_metric_stays_symmetric_and_the_points_inside() -> None:
+    """Only the symmetric part of a metric counts, so only it has a gradient; the backends agree on it."""
+    generator = torch.Generator().manual_seed(1)
+    A = torch.randn(8, 6, 3, dtype=torch.float64, generator=generator)
+    rows = Halfspaces(A, torch.rand(8, 6, dtype=torch.float64, generator=generator) + 0.2)
+    y, wanted = (torch.randn(8, 3, dtype=torch.float64, generator=generator) * scale for scale in (3.0, 1.0))
+    gradients = []
+    for backend in ("exact", "cvxpylayers"):
+        layer = ProjectOnto(torch.nn.Parameter(torch.eye(3, dtype=torch.float64)), backend)
+        (layer(rows, y).point - wanted).square().sum().backward()
+        gradients.append(layer.metric.grad)
+    torch.testing.assert_close(*gradients, rtol=1e-6, atol=1e-6)
+    layer = ProjectOnto(torch.nn.Parameter(torch.eye(3, dtype=torch.float64)))
+    optimiser = torch.optim.Adam(layer.parameters(), lr=0.03)
+    for _ in range(12):
+        optimiser.zero_grad()
+        (layer(rows, y).point - wanted).square().sum().backward()
+        optimiser.step()
+    assert layer.metric is not None
+    assert torch.equal(layer.metric, layer.metric.mT)
+    assert float(rows.slack(layer(rows, y).point).detach().min()) > -1e-12
+    skew = torch.tensor([[0.0, 0.3, 0.0], [-0.3, 0.0, 0.1], [0.0, -0.1, 0.0]], dtype=torch.float64)
+    torch.testing.assert_close(ProjectOnto(layer.metric + skew)(rows, y).point, layer(rows, y).point)
+
+
+def test_an_infeasible_item_leaves_shared_gradients_alone() -> None:
+    """An item without a solution is NaN; parameters that all items share have the gradient of the others."""
+    x, G, h, y, L = cp.Variable(2), cp.Parameter((4, 2)), cp.Parameter(4), cp.Parameter(2), cp.Parameter((2, 2))
+    problem = cp.Problem(cp.Minimize(cp.sum_squares(L @ x - y)), [G @ x <= h])
+    layer = CvxpyLayer(problem, [G, h, y, L], [x], solver=ActiveRowsSolver())
+    box = tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]).expand(3, 4, 2)
+    shared, point = torch.eye(2, dtype=torch.float64, requires_grad=True), torch.full((3, 2), 0.4, dtype=torch.float64)
+    bounds = torch.ones(3, 4, dtype=torch.float64)
+    bounds[0] = -5.0
+    (found,) = layer(box, bounds, point, shared)
+    assert found.isnan().all(-1).tolist() == [True, False, False]
+    (slope,) = torch.autograd.grad(found[1:].sum(), shared)
+    (others,) = layer(box[1:], bounds[1:], point[1:], shared)
+    torch.testing.assert_close(slope, torch.autograd.grad(others.sum(), shared)[0])

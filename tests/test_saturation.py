@@ -1,8 +1,13 @@
 """Clipped nominal controls: the set of wishes is an outer set, and no larger than it has to be."""
 
+import math
+from typing import Any
+
 import pytest
 import torch
+from torch import Tensor
 
+import torchfsid as fsid
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.inverse_optimal import FAN
 from torchfsid.kkt import outward_normals
@@ -90,3 +95,27 @@ def test_standing_still_in_a_dead_zone() -> None:
     rows = unclipped(admissible, LAZY, 8 * CORNERS.unsqueeze(0), torch.zeros(1, dtype=torch.float64))
     assert rows.contains(torch.tensor([[0.049, 0.0]], dtype=torch.float64)).all()
     assert not rows.contains(torch.tensor([[0.06, 0.0]], dtype=torch.float64)).any()
+
+
+@pytest.mark.parametrize("shape", ["norm", "box"])
+def test_a_limit_out_of_reach_has_no_gradient_and_spoils_none(shape: Any) -> None:
+    """No wish in the prior comes near the limit: as with a wide prior, whose set is the same."""
+
+    def gradient(half: float) -> Tensor:
+        gain = torch.tensor(0.9, dtype=torch.float64, requires_grad=True)
+        task = fsid.GoalTask(gain, saturation=Saturation(shape, (0.5, 0.5)))
+        x = torch.tensor([[0.0, 0.0], [3.0, 3.0]], dtype=torch.float64)
+        u = torch.tensor([[0.02, 0.03], [0.01, -0.02]], dtype=torch.float64)
+        avoidance = fsid.CollisionAvoidance(fsid.ClassK(1.5), safety_distance=0.4)
+        prior = fsid.FeasibleSet.from_box(x - half, x + half)
+        watching = fsid.SetMembershipObserver(task, [avoidance], prior, noise=fsid.NoiseBound(1e-2))
+        volume = watching.update(fsid.Measurement.of_team(0.0, x, u)).feasible_set.volume().sum()
+        return torch.autograd.grad(volume, gain)[0]
+
+    torch.testing.assert_close(gradient(0.1), gradient(5.0), rtol=1e-9, atol=0.0)
+
+
+def test_a_dead_zone_without_a_limit_is_differentiable() -> None:
+    wish = torch.tensor([[0.3, 0.4], [0.01, 0.02]], dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(Saturation("norm", (math.inf, math.inf), 0.05)(wish).sum(), wish)
+    assert slope.tolist() == [[1.0, 1.0], [0.0, 0.0]]

@@ -98,7 +98,7 @@ def clip(
     for some in cuts.chunks():
         part = polygon.select(some.item)
         table = _Table.of(part, *(field.index_select(0, some.item) for field in (A, b, time, source)))
-        rings, verdict, cut = _cut(Rings.of(part.vertices, part.count), some, table, against)
+        rings, verdict, cut = _cut(part, some, table, against)
         outcome[some.item] = verdict
         kept = (cut & (verdict != Outcome.EMPTY)).nonzero().squeeze(-1)
         shrunk[some.item[kept]] = True
@@ -204,8 +204,9 @@ def _boxed(polygon: Polygon, A: Float[Tensor, "B R 2"], b: Float[Tensor, "B R"])
     return beyond.any(0).nonzero().squeeze(-1)
 
 
-def _cut(rings: Rings, cuts: _Cuts, table: _Table, against: Contradiction) -> tuple[Rings, Tensor, Tensor]:
+def _cut(polygon: Polygon, cuts: _Cuts, table: _Table, against: Contradiction) -> tuple[Rings, Tensor, Tensor]:
     """The rings after all cuts, the `Outcome` of each, and whether it was cut; reports contradictions to `against`."""
+    rings = Rings.of(polygon.vertices, polygon.count)
     verdict = torch.full_like(cuts.number, Outcome.NONEMPTY)
     changed, first_row = torch.zeros_like(verdict, dtype=torch.bool), len(rings.x)
     turns = torch.arange(len(cuts.b), device=cuts.number.device).unsqueeze(-1)
@@ -218,13 +219,15 @@ def _cut(rings: Rings, cuts: _Cuts, table: _Table, against: Contradiction) -> tu
         cut = beyond & (lowest < -tolerance)
         touched = (beyond & ~cut).nonzero().squeeze(-1)
         if len(touched) > 0:
-            empty = lowest[touched] > tolerance[touched]
-            verdict[touched] = torch.where(empty, Outcome.EMPTY, Outcome.UNDECIDED)
-            lost = touched[empty]
+            verdict[touched] = Outcome.UNDECIDED
+            lost = touched[lowest[touched] > tolerance[touched]]
             closest, count = deepest[lost], rings.count[lost]
             met = rings.edge[:, lost].gather(0, torch.stack([(closest - 1) % count, closest]))
-            edges = torch.cat([first_row + row[None, lost], met]).T
-            table.select(lost).report(edges, cuts.item[lost], against)
+            edges, rows = torch.cat([first_row + row[None, lost], met]).T, table.select(lost)
+            proven = _contradict(take(rows.A, edges), rows.b.gather(1, edges), polygon.reach[lost])
+            proven = proven.nonzero().squeeze(-1)
+            verdict[lost[proven]] = Outcome.EMPTY
+            rows.select(proven).report(edges[proven], cuts.item[lost[proven]], against)
         some = cut.nonzero().squeeze(-1)
         if len(some) > 0:
             changed[some] = True
@@ -232,6 +235,24 @@ def _cut(rings: Rings, cuts: _Cuts, table: _Table, against: Contradiction) -> tu
             smaller = rings.select(some).cut(chosen(over, some), tolerance[some], deepest[some], row)
             rings = rings.replaced(some, smaller)
     return rings, verdict, changed
+
+
+def _contradict(A: Float[Tensor, "k 3 2"], b: Float[Tensor, "k 3"], reach: Float[Tensor, "k 2"]) -> Bool[Tensor, "k"]:
+    """Is it proven that no point within `reach` satisfies the three rows? The first one is beyond all vertices, the
+    others are the edges at the nearest vertex, which is itself uncertain where they are nearly parallel.
+
+    The proof is a y >= 0 with y_1 = 1 and y'b + |y'A| reach < 0 by more than round-off: the y for which y'A = 0, or, if
+    an edge alone will do, the y for which |y'A| is least.
+    """
+    A, b = A.detach(), b.detach()
+    row, first, second = A.unbind(1)
+    turn = cross(first, second)
+    both = torch.stack([cross(second, row), cross(row, first)], dim=-1) / turn.unsqueeze(-1)
+    alone = torch.diag_embed(-(A[:, 1:] * A[:, :1]).sum(-1) / A[:, 1:].square().sum(-1))
+    y = torch.cat([both.unsqueeze(1), alone], dim=1).nan_to_num(0.0, 0.0, 0.0).clamp(min=0)
+    y = torch.nn.functional.pad(y, (1, 0), value=1.0)
+    noise = (y @ round_off(A, b, reach).unsqueeze(-1)).squeeze(-1) + ((y @ A).abs() @ reach.unsqueeze(-1)).squeeze(-1)
+    return ((y @ b.unsqueeze(-1)).squeeze(-1) < -noise).any(-1)
 
 
 class _Table(NamedTuple):

@@ -166,13 +166,15 @@ class ActiveRowsSolver(SolverInterface):
         back = torch.linalg.inv(torch.cat([E, free.expand(len(q), -1, -1)], dim=1))
         x0, Z = times(back[..., :k], e), back[..., k:]
         metric = Z.mT @ H @ Z
-        metric = (metric + metric.mT) / 2
+        metric = programmes.symmetric(metric)
         y = -torch.linalg.solve(metric, times(Z.mT, times(H, x0) + q))
-        v, mu, rows, filled, _ = programmes.nearest(Halfspaces(N @ Z, o - times(N, x0)), y, metric)
-        x = x0 + times(Z, v)
-        multipliers = torch.zeros_like(o).scatter_add(-1, rows, torch.where(filled, mu, 0.0))
+        v, mu, rows, filled, status = programmes.nearest(Halfspaces(N @ Z, o - times(N, x0)), y, metric)
+        solved = (status == Status.OK).unsqueeze(-1)  # only at the end NaN elsewhere: it would spoil shared gradients
+        x = x0 + times(Z, torch.where(solved, v, 0.0))
+        multipliers = torch.zeros_like(o).scatter_add(-1, rows, torch.where(filled & solved, mu, 0.0))
         pull = times(H, x) + q + times(N.mT, multipliers)
-        return x, torch.cat([-times(back[..., :k].mT, pull), multipliers], dim=-1)
+        dual = torch.cat([-times(back[..., :k].mT, pull), multipliers], dim=-1)
+        return torch.where(solved, x, torch.nan), torch.where(solved, dual, torch.nan)
 
     @staticmethod
     def _dense(values: Tensor, at: tuple[Tensor, Tensor], shape: tuple[int, int]) -> Tensor:

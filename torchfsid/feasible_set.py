@@ -23,6 +23,7 @@ from torchfsid.errors import InputError
 from torchfsid.halfspaces import ROUND_OFF, Halfspaces, finite
 from torchfsid.polygon import Polygon
 from torchfsid.polytope import Polytope, clip_polytope, merge_polytope
+from torchfsid.programmes import symmetric
 
 MAX_FACETS = 32
 """Facets kept; more are merged outward. Costs below 1 % of the volume (tests/test_feasible_set.py)."""
@@ -196,8 +197,8 @@ class FeasibleSet:
         shape, (A, b) = self.batch_shape, (self.body.A, self.body.b)
         return Facets(
             Halfspaces(A.reshape(*shape, *A.shape[1:]), b.reshape(*shape, b.shape[-1])),
-            self.body.time.reshape((*shape, -1)),
-            self.body.source.reshape((*shape, -1)),
+            self.body.time.reshape((*shape, b.shape[-1])),
+            self.body.source.reshape((*shape, b.shape[-1])),
         )
 
     def contains(self, theta: Float[Tensor, "*batch p"], tolerance: float = 1e-9) -> Bool[Tensor, "*batch"]:
@@ -243,7 +244,7 @@ class FeasibleSet:
         if metric is not None:
             if metric.shape[-2:] != (p, p):
                 raise InputError("metric", f"(*batch, {p}, {p}), symmetric positive definite", tuple(metric.shape))
-            metric = metric.to(torch.float64).expand(*self.batch_shape, p, p).reshape(-1, p, p)
+            metric = symmetric(metric.to(torch.float64)).expand(*self.batch_shape, p, p).reshape(-1, p, p)
         flat = point.to(torch.float64).expand(*self.batch_shape, p).reshape(-1, p)
         return self._batched(self.body.nearest(flat, metric))
 

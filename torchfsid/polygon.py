@@ -70,7 +70,7 @@ class Polygon:
     def select(self, items: Int[Tensor, "k"]) -> Polygon:
         """The sub-batch at `items`, without the slots that none of it needs."""
         count = self.count[items]
-        slots = int(count.max()) if len(count) > 0 else 0
+        slots = int(count.max()) if len(count) > 0 else self.slots
         rings = (self.vertices, self.A, self.b, self.time, self.source)
         vertices, A, b, time, source = (field[:, :slots].index_select(0, items) for field in rings)
         return Polygon(vertices, A, b, time, source, count, self.reach[items])
@@ -132,13 +132,17 @@ class Polygon:
 
     def diameter(self) -> Float[Tensor, "B"]:
         """Largest distance between two points of the set."""
-        apart = (self.vertices.unsqueeze(1) - self.vertices.unsqueeze(2)).square().sum(-1)
-        largest = apart.flatten(1).amax(-1)
+        with torch.no_grad():
+            apart = (self.vertices.unsqueeze(1) - self.vertices.unsqueeze(2)).square().sum(-1).flatten(1)
+            ends = apart.argmax(-1, keepdim=True)
+        one, other = take(self.vertices, ends // self.slots), take(self.vertices, ends % self.slots)
+        largest = (one - other).square().sum(-1).squeeze(-1)
         return torch.where(largest > 0, largest.clamp(min=1e-300).sqrt(), 0.0)
 
     def support(self, direction: Float[Tensor, "B D 2"]) -> Float[Tensor, "B D"]:
-        """Support function h(n) = max n.z over the set."""
-        return (direction @ self.vertices.transpose(1, 2)).amax(-1)
+        """Support function h(n) = max n.z over the set; between tied vertices the derivatives of the first one."""
+        values = direction @ self.vertices.transpose(1, 2)
+        return values.gather(-1, values.detach().argmax(-1, keepdim=True)).squeeze(-1)
 
     def chebyshev(self) -> tuple[Float[Tensor, "B 2"], Float[Tensor, "B"]]:
         """Centre and radius of a largest inscribed disc.
@@ -150,10 +154,10 @@ class Polygon:
         """
         basis = None
         if use_kernel(None, self.vertices.detach()):
-            from torchfsid import polygon_kernel
+            from torchfsid import inscribed_kernel
 
             rows = array(self.vertices), array(self.A), array(self.b), array(self.count)
-            basis, centre, radius = map(torch.from_numpy, polygon_kernel.inscribed(*rows, ROUND_OFF))
+            basis, centre, radius = map(torch.from_numpy, inscribed_kernel.inscribed(*rows, ROUND_OFF))
             if use_kernel(None, self.vertices, self.A, self.b):
                 return centre, radius
         norms = torch.where(self.valid, self.A.square().sum(-1), 1.0).sqrt()

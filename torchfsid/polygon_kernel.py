@@ -3,8 +3,8 @@ r"""Polygons in scalar code: what `clipping` and `polygon` do in torch, one poly
 Of the rows that some vertex exceeds by more than round-off, the one that cut deepest at first cuts next:
 
     kept vertices  a.v - c <= tolerance: one arc of the ring, closed where the ring crosses the line
-    none kept      EMPTY: the row contradicts the two edges that meet at the vertex nearest to it
-    none strictly  UNDECIDED: the row only touches, it is not used
+    none kept      EMPTY, if the row provably contradicts the two edges that meet at the vertex nearest to it
+    none strictly  UNDECIDED: the row only touches, it is not used; likewise if nothing is proven
 
 `clipping` is the reference; tests compare the two. Every tolerance is an argument: numba's cache of compiled code does
 not see what changes in another file.
@@ -67,12 +67,15 @@ def _any_cuts(vertices, k, n, reach, A, b, tolerance, depth, cutting, epsilon):
 
 @compiled
 @no_type_check
-def _clip_ring(k, ring, edge, n, A, b, tolerance, depth, cutting, first_row, over, spare, spare_edge):
-    """Cut the ring of n vertices by the rows marked `cutting`, by their `depth`; row r makes the edge first_row + r.
+def _clip_ring(
+    k, ring, edge, n, A, b, tolerance, depth, cutting, ring_A, ring_b, reach, epsilon, over, spare, spare_edge
+):
+    """Cut the ring of n vertices by the rows marked `cutting`, by their `depth`. Edges are numbered by the slots of
+    `ring_A`, then by the rows.
 
     Returns (n, outcome, shrunk, and for EMPTY the row and the edges that contradict each other).
     """
-    outcome, shrunk = NONEMPTY, False
+    outcome, shrunk, first_row = NONEMPTY, False, ring_A.shape[1]
     while True:
         row = -1
         for r in range(b.shape[1]):
@@ -89,7 +92,10 @@ def _clip_ring(k, ring, edge, n, A, b, tolerance, depth, cutting, first_row, ove
         if over[outer] <= slack:  # an earlier cut has made it redundant
             continue
         if over[inner] > slack:
-            return n, EMPTY, False, row, edge[_before(inner, n)], edge[inner]
+            before, after = edge[_before(inner, n)], edge[inner]
+            first, second = _line(k, before, ring_A, ring_b, A, b), _line(k, after, ring_A, ring_b, A, b)
+            if _contradict((A[k, row, 0], A[k, row, 1], b[k, row]), first, second, reach[k, 0], reach[k, 1], epsilon):
+                return n, EMPTY, False, row, before, after
         if over[inner] >= -slack:
             outcome = UNDECIDED
             continue
@@ -115,6 +121,41 @@ def _clip_ring(k, ring, edge, n, A, b, tolerance, depth, cutting, first_row, ove
             new += 1
         n, shrunk = new, True
         _copy(spare, spare_edge, n, ring, edge)
+
+
+@compiled
+@no_type_check
+def _line(k, e, ring_A, ring_b, A, b):
+    """The line of an edge, by its number."""
+    V = ring_A.shape[1]
+    if e < V:
+        return ring_A[k, e, 0], ring_A[k, e, 1], ring_b[k, e]
+    return A[k, e - V, 0], A[k, e - V, 1], b[k, e - V]
+
+
+@compiled
+@no_type_check
+def _contradict(row, first, second, reach_x, reach_y, epsilon):
+    """`clipping._contradict`, of three lines (p, q, c)."""
+    turn = first[0] * second[1] - first[1] * second[0]
+    along = row[0] * first[0] + row[1] * first[1], row[0] * second[0] + row[1] * second[1]
+    for proof in range(3):
+        y = z = 0.0
+        if proof == 0 and turn != 0:
+            y = (second[0] * row[1] - second[1] * row[0]) / turn
+            z = (row[0] * first[1] - row[1] * first[0]) / turn
+        elif proof == 1:
+            y = -along[0] / (first[0] * first[0] + first[1] * first[1])
+        elif proof == 2:
+            z = -along[1] / (second[0] * second[0] + second[1] * second[1])
+        y, z = max(y, 0.0), max(z, 0.0)
+        p, q = row[0] + y * first[0] + z * second[0], row[1] + y * first[1] + z * second[1]
+        noise = abs(p) * reach_x + abs(q) * reach_y
+        for weight, line in ((1.0, row), (y, first), (z, second)):
+            noise += epsilon * weight * (abs(line[0]) * reach_x + abs(line[1]) * reach_y + abs(line[2]))
+        if row[2] + y * first[2] + z * second[2] < -noise:
+            return True
+    return False
 
 
 @compiled
@@ -244,7 +285,7 @@ def clip(polygons, A, b, stamp, source, most, epsilon, parallel):
         for i in range(n):
             ring[i, 0], ring[i, 1], edge[i] = vertices[k, i, 0], vertices[k, i, 1], i
         n, outcome[k], shrunk[k], row, before, after = _clip_ring(
-            k, ring, edge, n, A, b, tolerance, depth, cutting, V, over, spare, spare_edge
+            k, ring, edge, n, A, b, tolerance, depth, cutting, ring_A, ring_b, reach, epsilon, over, spare, spare_edge
         )
         if outcome[k] == EMPTY:
             for i, e in enumerate((V + row, before, after)):
@@ -279,62 +320,3 @@ def clip(polygons, A, b, stamp, source, most, epsilon, parallel):
             else:
                 to_A[k, i, 0], to_A[k, i, 1], to_b[k, i], to_time[k, i], to_source[k, i] = 0.0, 0.0, 1.0, np.nan, -1
     return result, outcome, shrunk, (lost_A, lost_b, lost_time, lost_source)
-
-
-@compiled
-@no_type_check
-def inscribed(vertices, A, b, count, epsilon):
-    """A largest inscribed disc of each polygon, as in `Polygon.chebyshev`: its rows, centre and radius."""
-    B, V = b.shape
-    basis, centre, radius = np.empty((B, 3), np.int64), np.zeros((B, 2)), np.empty(B)
-    row, right, inverse, solution = np.empty((V, 2)), np.empty(V), np.empty((3, 3)), np.empty(3)
-    for k in range(B):
-        n, half, scale = count[k], 1, 0.0
-        for i in range(n):
-            centre[k, 0] += vertices[k, i, 0] / n
-            centre[k, 1] += vertices[k, i, 1] / n
-        for i in range(n):
-            norm = math.sqrt(A[k, i, 0] ** 2 + A[k, i, 1] ** 2)
-            row[i, 0], row[i, 1] = A[k, i, 0] / norm, A[k, i, 1] / norm
-            right[i] = b[k, i] / norm - (row[i, 0] * centre[k, 0] + row[i, 1] * centre[k, 1])
-            scale = max(scale, abs(right[i]))
-        while half < n - 2 and row[0, 0] * row[half + 1, 1] - row[0, 1] * row[half + 1, 0] >= 0:
-            half += 1
-        basis[k, 0], basis[k, 1], basis[k, 2] = 0, half, half + 1
-        for _ in range(3 * V):
-            _inverse_with_ones(row, basis[k], inverse)
-            for i in range(3):
-                solution[i] = 0.0
-                for j in range(3):
-                    solution[i] += inverse[i, j] * right[basis[k, j]]
-            worst, entering = -np.inf, 0
-            for i in range(n):
-                violation = row[i, 0] * solution[0] + row[i, 1] * solution[1] + solution[2] - right[i]
-                if violation > worst:
-                    worst, entering = violation, i
-            if not worst > epsilon * scale:
-                break
-            least, leaving = np.inf, 0
-            for j in range(3):
-                share = row[entering, 0] * inverse[0, j] + row[entering, 1] * inverse[1, j] + inverse[2, j]
-                if share > epsilon and max(inverse[2, j], 0.0) / share < least:
-                    least, leaving = max(inverse[2, j], 0.0) / share, j
-            basis[k, leaving] = entering
-        centre[k, 0] += solution[0]
-        centre[k, 1] += solution[1]
-        radius[k] = solution[2]
-    return basis, centre, radius
-
-
-@compiled
-@no_type_check
-def _inverse_with_ones(rows, basis, inverse):
-    for i in range(3):
-        p, q = basis[(i + 1) % 3], basis[(i + 2) % 3]
-        inverse[0, i] = rows[p, 1] - rows[q, 1]
-        inverse[1, i] = rows[q, 0] - rows[p, 0]
-        inverse[2, i] = rows[p, 0] * rows[q, 1] - rows[p, 1] * rows[q, 0]
-    determinant = rows[basis[0], 0] * inverse[0, 0] + rows[basis[0], 1] * inverse[1, 0] + inverse[2, 0]
-    for i in range(3):
-        for j in range(3):
-            inverse[i, j] /= determinant

@@ -150,7 +150,8 @@ class Polytope:
 
     def support(self, direction: Float[Tensor, "B D p"]) -> Float[Tensor, "B D"]:
         """Support function h(n) = max n.z over the set."""
-        return (direction @ self.vertices.transpose(1, 2)).amax(-1)
+        values = direction @ self.vertices.transpose(1, 2)
+        return values.gather(-1, values.detach().argmax(-1, keepdim=True)).squeeze(-1)
 
     def chebyshev(self) -> tuple[Float[Tensor, "B p"], Float[Tensor, "B"]]:
         """Centre and radius of a largest inscribed ball: max r s.t. A_f.z + |A_f| r <= b_f.

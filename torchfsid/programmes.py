@@ -100,7 +100,12 @@ def broadcast(
         A, b = halfspaces.A.expand(*batch, halfspaces.rows, p), halfspaces.b.expand(*batch, halfspaces.rows)
         halfspaces, point = Halfspaces(A, b), point.expand(*batch, p)
         metric = None if metric is None else metric.expand(*batch, p, p)
-    return halfspaces, point.to(torch.float64), None if metric is None else metric.to(torch.float64)
+    return halfspaces, point.to(torch.float64), None if metric is None else symmetric(metric.to(torch.float64))
+
+
+def symmetric(metric: Float[Tensor, "*batch p p"]) -> Float[Tensor, "*batch p p"]:
+    """The symmetric part, all of a metric that counts: so its gradient is symmetric, and a trained one stays it."""
+    return (metric + metric.mT) / 2
 
 
 def solve_active(

@@ -80,7 +80,7 @@ def _unclipped(
     by_norm = saturation.shape == "norm"
     # A limit beyond every possible wish is no limit: any finite one serves.
     farthest = possible.norm(dim=-1).amax(-1, keepdim=True) + margin.unsqueeze(-1)
-    limits = torch.minimum(like.new_tensor(saturation.limits), 2 * farthest)
+    limits = torch.minimum(like.new_tensor(saturation.limits), 2 * farthest.detach())
     corner = Polygon.from_box(-limits, limits)
     reach = limits[:, :1] if by_norm else 2 * limits.amax(-1, keepdim=True)
     tangents = Halfspaces(around, reach.expand(-1, DIRECTIONS))

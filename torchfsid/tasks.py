@@ -46,7 +46,8 @@ class Saturation:
     def __call__(self, y: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
         speed = y.square().sum(-1, keepdim=True).clamp(min=1e-300).sqrt()
         if self.shape == "norm":
-            clipped = y * (self.limits[0] / speed).clamp(max=1.0)
+            limit = self.limits[0]
+            clipped = y if math.isinf(limit) else y * (limit / speed).clamp(max=1.0)
         else:
             limits = y.new_tensor(self.limits)
             clipped = y.clamp(-limits, limits)
