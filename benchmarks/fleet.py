@@ -21,7 +21,7 @@ from torch import Tensor
 
 from benchmarks import save
 from benchmarks.scenario import NEIGHBOURS, Fleet, measured, observer
-from torchfsid.compiled import installed
+from torchfsid.kernels.compiled import installed
 
 SIZES, LEAST, BLOCK = (1_000, 10_000, 100_000), 10_000, 10
 CROWDS = (4, 8, 16, 32)

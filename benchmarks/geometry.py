@@ -27,8 +27,8 @@ import torch
 
 from benchmarks import save
 from benchmarks.peers import BOX, PEERS, Answer, installed
-from torchfsid.feasible_set import FeasibleSet
 from torchfsid.halfspaces import Halfspaces
+from torchfsid.sets.feasible_set import FeasibleSet
 
 WIDTHS = {"ordinary": None, "1e-4": 1e-4, "1e-6": 1e-6, "1e-8": 1e-8, "2e-9": 2e-9}
 WRONG = 0.01

@@ -29,7 +29,8 @@ from rich.table import Table
 from torch import Tensor
 
 from benchmarks import save
-from torchfsid import ChebyshevCentre, Halfspaces, ProjectOnto, active_rows, conic
+from torchfsid import ChebyshevCentre, Halfspaces, ProjectOnto
+from torchfsid.programmes import active_rows, conic
 
 ROWS = (8, 24, 64)
 BATCHES = (1, 32, 256, 1024)

@@ -18,10 +18,10 @@ import torch
 
 from benchmarks import save
 from benchmarks.scenario import BARRIER, EPISODE, ERROR, TASK, Fleet, measured, observer
-from torchfsid.compiled import installed
-from torchfsid.hybrid import HybridObserver
-from torchfsid.measurement import Observer
-from torchfsid.ukf import ParameterUkf
+from torchfsid.kernels.compiled import installed
+from torchfsid.observers.hybrid import HybridObserver
+from torchfsid.observers.protocol import Observer
+from torchfsid.observers.ukf import ParameterUkf
 
 SIZES = (1, 10, 100)
 AMONG = 9

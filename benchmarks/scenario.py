@@ -15,13 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfsid.barriers import ClassK, CollisionAvoidance
-from torchfsid.feasible_set import FeasibleSet
-from torchfsid.inverse_optimal import NoiseBound
-from torchfsid.measurement import Measurement
-from torchfsid.neighbours import nearest_bodies
-from torchfsid.observer import SetMembershipObserver
-from torchfsid.tasks import GoalTask
+from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.bounds import NoiseBound
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.neighbours import nearest_bodies
+from torchfsid.robots.tasks import GoalTask
+from torchfsid.sets.feasible_set import FeasibleSet
 
 NEIGHBOURS, STEP, EPISODE, ERROR = 8, 0.05, 40, 5e-3
 TASK, BARRIER = GoalTask(0.9), CollisionAvoidance(ClassK(1.5), safety_distance=0.4)

@@ -18,7 +18,7 @@ from experiments.sweep_config import load_sweep
 from torchfsid.errors import ConfigError, FsidError
 
 if TYPE_CHECKING:
-    from torchfsid.measurement import Measurement
+    from torchfsid.robots.measurement import Measurement
 
 USAGE_ERROR, INTERRUPTED = 2, 130
 
@@ -122,7 +122,7 @@ def _sweep(path: Path, out: Path, overrides: Sequence[str], jobs: int, dask: str
         TimeRemainingColumn,
     )
 
-    from torchfsid.results import write_json
+    from torchfsid.commands.results import write_json
 
     try:
         from experiments.sweep import sweep

@@ -20,8 +20,8 @@ from torch import Tensor
 
 from experiments.config import CaseConfig, CasesConfig
 from experiments.recording import Recording
-from torchfsid.controller import CbfQpController
-from torchfsid.measurement import Measurement
+from torchfsid.robots.controller import CbfQpController
+from torchfsid.robots.measurement import Measurement
 
 
 def record_cases(config: CasesConfig) -> Recording:

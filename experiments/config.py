@@ -13,17 +13,17 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from torchfsid.config import (
+from torchfsid.config.documents import Strict, apply_overrides, read_yaml, validate, wrong
+from torchfsid.config.observe import (
     AvoidanceConfig,
     BarrierConfig,
     NoiseConfig,
     PriorConfig,
     UkfConfig,
 )
-from torchfsid.documents import Strict, apply_overrides, read_yaml, validate, wrong
+from torchfsid.config.quantities import BodyName, NonNegative, Number, PlanarVector, Positive
+from torchfsid.config.tasks import GoalConfig
 from torchfsid.errors import ConfigError
-from torchfsid.quantities import BodyName, NonNegative, Number, PlanarVector, Positive
-from torchfsid.task_config import GoalConfig
 
 MAX_STEPS = 1_000_000
 """More is a slip of the pen in dt or duration."""

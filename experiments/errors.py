@@ -18,11 +18,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from experiments.config import SceneConfig
-from torchfsid.barriers import Barrier, stack_barriers
-from torchfsid.feasible_set import FeasibleSet
-from torchfsid.measurement import Measurement
-from torchfsid.observer import SetMembershipObserver
-from torchfsid.simulation import Trajectory
+from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.robots.barriers import Barrier, stack_barriers
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.simulation import Trajectory
+from torchfsid.sets.feasible_set import FeasibleSet
 
 DIRECTIONS = 8
 

@@ -11,11 +11,11 @@ from experiments.config import ExperimentConfig
 from experiments.recording import Recording
 from experiments.saved import SETS
 from experiments.tally import SetTally, Tally
-from torchfsid.feasible_set import FeasibleSet
-from torchfsid.hybrid import HybridEstimate, HybridObserver
-from torchfsid.measurement import Measurement
-from torchfsid.observer import SetEstimate, SetMembershipObserver
-from torchfsid.ukf import ParameterUkf
+from torchfsid.observers.hybrid import HybridEstimate, HybridObserver
+from torchfsid.observers.set_membership import SetEstimate, SetMembershipObserver
+from torchfsid.observers.ukf import ParameterUkf
+from torchfsid.robots.measurement import Measurement
+from torchfsid.sets.feasible_set import FeasibleSet
 
 
 @dataclass

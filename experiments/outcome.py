@@ -18,12 +18,13 @@ from experiments.config import SceneConfig
 from experiments.observers import Observers
 from experiments.recording import Scene, simulate_scene
 from experiments.saved import SETS
-from torchfsid.active_set import active_set
-from torchfsid.barriers import stack_barriers
-from torchfsid.hybrid import HybridEstimate
-from torchfsid.kkt import CASES, solve_kkt
-from torchfsid.measurement import Measurement
-from torchfsid.observer import Event, SetEstimate, Status
+from torchfsid.identification.active_set import active_set
+from torchfsid.identification.kkt import CASES, solve_kkt
+from torchfsid.observers.hybrid import HybridEstimate
+from torchfsid.observers.set_membership import Event, SetEstimate
+from torchfsid.outcome import Status
+from torchfsid.robots.barriers import stack_barriers
+from torchfsid.robots.measurement import Measurement
 
 EXACTLY_ACTIVE = 1e-9
 """Distance to its boundary below which a row of the true controls is active [m/s]: round-off of the controller."""

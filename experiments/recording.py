@@ -11,11 +11,11 @@ from torch import Tensor
 
 from experiments.config import SceneConfig
 from experiments.errors import measure
-from torchfsid.barriers import Barrier
-from torchfsid.controller import CbfQpController
-from torchfsid.measurement import Measurement
-from torchfsid.simulation import Trajectory, simulate
-from torchfsid.tasks import Task
+from torchfsid.robots.barriers import Barrier
+from torchfsid.robots.controller import CbfQpController
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.simulation import Trajectory, simulate
+from torchfsid.robots.tasks import Task
 
 
 @dataclass(frozen=True)

@@ -27,12 +27,12 @@ from experiments.saved import Results
 from experiments.summary import summarise_scene
 from experiments.swarm import run_swarm
 from experiments.table import measure_cases
-from torchfsid.barriers import stack_barriers
-from torchfsid.documents import dump
-from torchfsid.measurement import Measurement
-from torchfsid.observer import SetEstimate
-from torchfsid.results import ResultsWriter, write_json
-from torchfsid.simulation import Trajectory
+from torchfsid.commands.results import ResultsWriter, write_json
+from torchfsid.config.documents import dump
+from torchfsid.observers.set_membership import SetEstimate
+from torchfsid.robots.barriers import stack_barriers
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.simulation import Trajectory
 
 Track = Callable[[Iterable[Measurement], int], Iterable[Measurement]]
 """Passes measurements on and shows how far they have come; the number is how many there are."""

@@ -15,7 +15,7 @@ from experiments.config import ExpectedConfig, ExperimentConfig, SceneConfig
 from experiments.lengths import lengths, prior_lengths
 from experiments.observers import Observers
 from experiments.saved import Results
-from torchfsid.simulation import Trajectory
+from torchfsid.robots.simulation import Trajectory
 
 SHARES = (0.1, 0.01)
 

@@ -27,15 +27,15 @@ from torch import Tensor
 
 from experiments.config import SwarmConfig
 from experiments.errors import in_disc
-from torchfsid.controller import CbfQpController
-from torchfsid.documents import dump
-from torchfsid.feasible_set import FeasibleSet
-from torchfsid.kkt import CASES
-from torchfsid.measurement import Measurement
-from torchfsid.neighbours import nearest_bodies
-from torchfsid.observer import SetEstimate, SetMembershipObserver
-from torchfsid.results import STATUS_NAMES, write_json
-from torchfsid.simulation import IDLE, STILL
+from torchfsid.commands.results import STATUS_NAMES, write_json
+from torchfsid.config.documents import dump
+from torchfsid.identification.kkt import CASES
+from torchfsid.observers.set_membership import SetEstimate, SetMembershipObserver
+from torchfsid.robots.controller import CbfQpController
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.neighbours import nearest_bodies
+from torchfsid.robots.simulation import IDLE, STILL
+from torchfsid.sets.feasible_set import FeasibleSet
 
 QUANTILES = (0.1, 0.5, 0.9, 1.0)
 SIZES = ("t", *(f"sqrt_area_{q:g}" for q in QUANTILES), "lost", "still", "memory_mib")

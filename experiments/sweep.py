@@ -22,7 +22,7 @@ from experiments.journal import Journal
 from experiments.outcome import outcome
 from experiments.sweep_config import SweepConfig
 from experiments.sweep_tables import write_tables
-from torchfsid.documents import dump
+from torchfsid.config.documents import dump
 from torchfsid.errors import ConfigError, FsidError, one_line
 
 DASK_TIMEOUT = 10

@@ -21,9 +21,9 @@ from pydantic import Field, model_validator
 
 from experiments.config import SceneConfig, Text, WholeNumber, require_increasing
 from experiments.teams import TeamConfig
-from torchfsid.documents import Strict, apply_overrides, read_yaml, validate, wrong
+from torchfsid.config.documents import Strict, apply_overrides, read_yaml, validate, wrong
+from torchfsid.config.quantities import NonNegative, Number
 from torchfsid.errors import ConfigError
-from torchfsid.quantities import NonNegative, Number
 
 MAX_RUNS = 1_000_000
 """More is a slip of the pen in the grid."""

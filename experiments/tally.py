@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchfsid.feasible_set import FeasibleSet
-from torchfsid.hybrid import HybridEstimate
-from torchfsid.observer import SetEstimate
+from torchfsid.observers.hybrid import HybridEstimate
+from torchfsid.observers.set_membership import SetEstimate
+from torchfsid.sets.feasible_set import FeasibleSet
 
 ROUND_OFF = 1e-9
 """Relative change of an area that is round-off."""

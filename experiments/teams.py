@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from torchfsid.documents import Strict, wrong
+from torchfsid.config.documents import Strict, wrong
+from torchfsid.config.quantities import NonNegative, Positive
 from torchfsid.errors import ConfigError
-from torchfsid.quantities import NonNegative, Positive
 
 TRIES = 1000
 """Places tried for a body before there is no room for it."""

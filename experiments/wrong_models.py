@@ -17,16 +17,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchfsid.barriers import Barrier, ClassK, CollisionAvoidance
-from torchfsid.consistency import Consistency
-from torchfsid.controller import CbfQpController
-from torchfsid.feasible_set import FeasibleSet
-from torchfsid.inverse_optimal import NoiseBound
-from torchfsid.measurement import Measurement
-from torchfsid.observer import SetMembershipObserver, Status
-from torchfsid.scene import AUTO_FACTOR
-from torchfsid.simulation import Trajectory, simulate
-from torchfsid.tasks import GoalTask, OrbitTask, Saturation, Task, VelocityTask
+from torchfsid.commands.scene import AUTO_FACTOR
+from torchfsid.observers.consistency import Consistency
+from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.outcome import Status
+from torchfsid.robots.barriers import Barrier, ClassK, CollisionAvoidance
+from torchfsid.robots.bounds import NoiseBound
+from torchfsid.robots.controller import CbfQpController
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.simulation import Trajectory, simulate
+from torchfsid.robots.tasks import GoalTask, OrbitTask, Saturation, Task, VelocityTask
+from torchfsid.sets.feasible_set import FeasibleSet
 
 ROBOTS, DT, STEPS, GAIN = 4, 0.05, 120, 0.8
 AVOIDANCE = CollisionAvoidance(ClassK(2.0), safety_distance=0.5, neighbour_velocity="current")

@@ -12,8 +12,8 @@ import yaml
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from torchfsid.bags import ODOMETRY, POSE, TRANSFORMS
-from torchfsid.logs import Log, read_csv
+from torchfsid.logs.bags import ODOMETRY, POSE, TRANSFORMS
+from torchfsid.logs.log import Log, read_csv
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 TYPES = STORE.types

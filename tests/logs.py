@@ -8,7 +8,7 @@ import torch
 import yaml
 from torch import Tensor
 
-from torchfsid.simulation import Trajectory
+from torchfsid.robots.simulation import Trajectory
 
 
 def write_log(path: Path, run: Trajectory, bodies: Sequence[str], errors: Tensor | None = None) -> Path:

@@ -12,12 +12,13 @@ from hypothesis import strategies as st
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from tests.bag_writer import odometry, odometry_of, pose, section_of, transforms, write_bag, yawed
-from torchfsid.bags import ODOMETRY, POSE, TRANSFORMS, BagConfig, read_bag
 from torchfsid.cli import main
-from torchfsid.documents import validate
+from torchfsid.config.bags import BagConfig
+from torchfsid.config.documents import validate
 from torchfsid.errors import ConfigError, FsidError, LogError
-from torchfsid.logs import Log, read_csv
-from torchfsid.sources import read_log
+from torchfsid.logs.bags import ODOMETRY, POSE, TRANSFORMS, read_bag
+from torchfsid.logs.log import Log, read_csv
+from torchfsid.logs.read import read_log
 
 CSV = """t,robot,x,y,vx,vy,radius
 0,ann,-1.5,0.25,0.125,-0.5,0.2
@@ -338,7 +339,7 @@ def test_damaged_bags_are_one_line(bags, csv_log, tmp_path_factory, data):
 
 def test_reading_does_not_wait_for_torch_or_ros():
     slow = {"torch", "rosbags", "pyarrow"}
-    code = f"import sys, torchfsid.sources, torchfsid.config; sys.exit(bool({slow} & set(sys.modules)))"
+    code = f"import sys, torchfsid.logs.read, torchfsid.config.observe; sys.exit(bool({slow} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

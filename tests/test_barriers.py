@@ -18,10 +18,10 @@ from torchfsid import (
     SetMembershipObserver,
     simulate,
 )
-from torchfsid.barriers import AffineBarrier, Arena, ClassK, SpeedPolygon
-from torchfsid.config import AvoidanceConfig, ClassKConfig
+from torchfsid.config.observe import AvoidanceConfig, ClassKConfig
 from torchfsid.errors import ConfigError, InputError
-from torchfsid.measurement import Measurement
+from torchfsid.robots.barriers import AffineBarrier, Arena, ClassK, SpeedPolygon
+from torchfsid.robots.measurement import Measurement
 
 AT_REST = Measurement.of_team(0.0, torch.zeros(1, 2), torch.zeros(1, 2))
 

@@ -9,19 +9,20 @@ import torch
 import yaml
 
 from tests.logs import bounded_errors, write_config, write_log
-from torchfsid.barriers import ClassK, CollisionAvoidance
-from torchfsid.check import check
 from torchfsid.cli import main
-from torchfsid.config import ObserveConfig
-from torchfsid.consistency import RESOLUTION, SMALLEST
-from torchfsid.controller import CbfQpController
-from torchfsid.documents import validate
-from torchfsid.inverse_optimal import NoiseBound
-from torchfsid.logs import read_csv
-from torchfsid.observer import SetMembershipObserver, Status
-from torchfsid.scene import Scene
-from torchfsid.simulation import Trajectory, simulate
-from torchfsid.tasks import GoalTask, Saturation
+from torchfsid.commands.check import check
+from torchfsid.commands.scene import Scene
+from torchfsid.config.documents import validate
+from torchfsid.config.observe import ObserveConfig
+from torchfsid.logs.log import read_csv
+from torchfsid.observers.consistency import RESOLUTION, SMALLEST
+from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.outcome import Status
+from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.bounds import NoiseBound
+from torchfsid.robots.controller import CbfQpController
+from torchfsid.robots.simulation import Trajectory, simulate
+from torchfsid.robots.tasks import GoalTask, Saturation
 
 GOALS = {"ann": (2.0, 0.1), "bob": (-2.0, 0.0)}
 BODIES = [*GOALS, "pillar"]

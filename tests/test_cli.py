@@ -8,11 +8,11 @@ import pytest
 import torch
 import yaml
 
-from torchfsid.barriers import ClassK, CollisionAvoidance
 from torchfsid.cli import main
-from torchfsid.controller import CbfQpController
-from torchfsid.simulation import simulate
-from torchfsid.tasks import GoalTask
+from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.controller import CbfQpController
+from torchfsid.robots.simulation import simulate
+from torchfsid.robots.tasks import GoalTask
 
 GOALS = {"ann": (2.0, 0.1), "bob": (-2.0, 0.0)}
 CONFIG = {

@@ -10,14 +10,14 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchfsid.active_set import ACTIVE_TOLERANCE
-from torchfsid.barriers import Arena, ClassK, CollisionAvoidance, SpeedBox, SpeedPolygon
-from torchfsid.config import BarrierConfig, ObserveConfig, PriorConfig
-from torchfsid.documents import Strict, apply_overrides, dump, load, read_yaml, validate
+from torchfsid.config.documents import Strict, apply_overrides, dump, load, read_yaml, validate
+from torchfsid.config.observe import BarrierConfig, ObserveConfig, PriorConfig
+from torchfsid.config.tasks import TaskConfig
 from torchfsid.errors import ConfigError
-from torchfsid.inverse_optimal import NoiseBound
-from torchfsid.task_config import TaskConfig
-from torchfsid.tasks import FormationTask, GoalTask, OrbitTask, PatrolTask, UnknownGainGoalTask, VelocityTask
+from torchfsid.robots.barriers import Arena, ClassK, CollisionAvoidance, SpeedBox, SpeedPolygon
+from torchfsid.robots.bounds import NoiseBound
+from torchfsid.robots.tasks import FormationTask, GoalTask, OrbitTask, PatrolTask, UnknownGainGoalTask, VelocityTask
+from torchfsid.tolerances import ACTIVE_TOLERANCE
 
 IRSIM = """
 task: {kind: goal, gain: 0.09}

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from torchfsid.barriers import ClassK, CollisionAvoidance, SpeedBox, stack_barriers
-from torchfsid.controller import CbfQpController, solve_safe_qp
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.kkt import solve_kkt
-from torchfsid.measurement import Measurement
-from torchfsid.tasks import GoalTask
+from torchfsid.identification.kkt import solve_kkt
+from torchfsid.robots.barriers import ClassK, CollisionAvoidance, SpeedBox, stack_barriers
+from torchfsid.robots.controller import CbfQpController, solve_safe_qp
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.tasks import GoalTask
 
 INFEASIBLE = -1
 """daqp's exit flag."""

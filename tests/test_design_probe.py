@@ -19,15 +19,15 @@ from experiments.design.probe import Objective, Probing, along, expectation
 from experiments.design.rollout import closed_loop
 from experiments.design.switches import across, summarise_switches
 from experiments.design.tables import read_rows
-from torchfsid.barriers import ClassK, CollisionAvoidance
-from torchfsid.controller import CbfQpController
-from torchfsid.documents import dump
-from torchfsid.feasible_set import FeasibleSet
-from torchfsid.inverse_optimal import NoiseBound
-from torchfsid.observer import SetMembershipObserver
-from torchfsid.reading import SetKind
-from torchfsid.simulation import simulate
-from torchfsid.tasks import GoalTask
+from torchfsid.config.documents import dump
+from torchfsid.identification.evidence import SetKind
+from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.bounds import NoiseBound
+from torchfsid.robots.controller import CbfQpController
+from torchfsid.robots.simulation import simulate
+from torchfsid.robots.tasks import GoalTask
+from torchfsid.sets.feasible_set import FeasibleSet
 
 CONFIG = Path(__file__).parents[1] / "configs" / "probe_placement.yaml"
 SMALL = (

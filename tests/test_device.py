@@ -10,8 +10,8 @@ from torch import Tensor
 
 import torchfsid as fsid
 from tests.devices import ElsewhereMode
-from torchfsid.barriers import Arena, Barrier, ClassK, SpeedBox, SpeedPolygon
-from torchfsid.tasks import Saturation
+from torchfsid.robots.barriers import Arena, Barrier, ClassK, SpeedBox, SpeedPolygon
+from torchfsid.robots.tasks import Saturation
 
 GOALS = torch.tensor([[2.0, 0.1], [-2.0, 0.0], [0.1, -1.5]], dtype=torch.float64)
 STARTS = torch.tensor([[-2.0, 0.0], [2.0, 0.3], [0.0, 1.5]], dtype=torch.float64)

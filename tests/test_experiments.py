@@ -20,8 +20,8 @@ from experiments.recording import simulate_scene
 from experiments.run import run
 from experiments.saved import SETS, Results
 from experiments.summary import compare, stays_below, timeline
-from torchfsid.documents import dump
-from torchfsid.logs import read_csv
+from torchfsid.config.documents import dump
+from torchfsid.logs.log import read_csv
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 SHORT = ("duration=0.2", "snapshots=[0.1]", "expected=[]")

@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
-from torchfsid.clipping import Outcome
 from torchfsid.errors import InputError
-from torchfsid.feasible_set import MAX_FACETS, FeasibleSet
 from torchfsid.halfspaces import Halfspaces
+from torchfsid.outcome import Outcome
+from torchfsid.sets.feasible_set import MAX_FACETS, FeasibleSet
 
 TRUTH = {1: [0.3], 2: [0.3, -1.2], 3: [0.3, -1.2, 0.8], 4: [0.3, -1.2, 0.8, 0.1]}
 

@@ -8,8 +8,8 @@ import torch
 
 from benchmarks import fleet, geometry, observer, scenario
 from tests.problems import exact_area, exact_box, exact_intersection, solve_qp
-from torchfsid.barriers import CollisionAvoidance
-from torchfsid.feasible_set import MAX_FACETS
+from torchfsid.robots.barriers import CollisionAvoidance
+from torchfsid.sets.feasible_set import MAX_FACETS
 
 
 @pytest.mark.parametrize("compiled", [True, False], ids=["compiled", "torch"])

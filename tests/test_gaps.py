@@ -9,15 +9,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchfsid.barriers import ClassK, CollisionAvoidance
-from torchfsid.controller import CbfQpController
-from torchfsid.feasible_set import FeasibleSet
-from torchfsid.gaps import bridged
-from torchfsid.inverse_optimal import NoiseBound
-from torchfsid.logs import Log
-from torchfsid.observer import SetMembershipObserver, Status
-from torchfsid.simulation import Trajectory, simulate
-from torchfsid.tasks import GoalTask
+from torchfsid.logs.gaps import bridged
+from torchfsid.logs.log import Log
+from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.outcome import Status
+from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.bounds import NoiseBound
+from torchfsid.robots.controller import CbfQpController
+from torchfsid.robots.simulation import Trajectory, simulate
+from torchfsid.robots.tasks import GoalTask
+from torchfsid.sets.feasible_set import FeasibleSet
 
 ROBOTS, TASK = 4, GoalTask(0.9)
 BODIES = ("a", "b", "c", "d", "pillar")

@@ -8,11 +8,11 @@ from pathlib import Path
 import torch
 
 from tests.logs import bounded_errors, write_log
-from torchfsid.barriers import ClassK, CollisionAvoidance
 from torchfsid.cli import main
-from torchfsid.controller import CbfQpController
-from torchfsid.simulation import Trajectory, simulate
-from torchfsid.tasks import GoalTask
+from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.controller import CbfQpController
+from torchfsid.robots.simulation import Trajectory, simulate
+from torchfsid.robots.tasks import GoalTask
 
 CONFIG = Path(__file__).parent.parent / "configs" / "goal_switch.yaml"
 DT, SWITCH = 0.05, 40

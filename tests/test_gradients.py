@@ -15,14 +15,15 @@ from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
 from tests.problems import CASES, batch, paper_case, random_scene
-from torchfsid.barriers import ClassK, CollisionAvoidance
-from torchfsid.clipping import clip
-from torchfsid.critical_region import critical_region
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.inverse_optimal import NoiseBound, inverse_optimal_set
-from torchfsid.measurement import Measurement
-from torchfsid.polygon import Polygon
-from torchfsid.tasks import GoalTask
+from torchfsid.identification.critical_region import critical_region
+from torchfsid.identification.inverse_optimal import inverse_optimal_set
+from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.bounds import NoiseBound
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.tasks import GoalTask
+from torchfsid.sets.clipping import clip
+from torchfsid.sets.polygon import Polygon
 
 OUTSIDE = torch.tensor([[4.0, 3.5], [-3.0, 5.0]], dtype=torch.float64).repeat(100, 1)
 DIRECTIONS = torch.tensor([[[0.6, 0.8]], [[-1.0, 0.3]]], dtype=torch.float64).repeat(100, 1, 1)

@@ -10,18 +10,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchfsid.barriers import ClassK, CollisionAvoidance
-from torchfsid.controller import CbfQpController
 from torchfsid.errors import InputError
-from torchfsid.feasible_set import FeasibleSet
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.hybrid import CONDITION, HybridObserver
-from torchfsid.inverse_optimal import NoiseBound
-from torchfsid.measurement import Measurement
-from torchfsid.observer import SetMembershipObserver
-from torchfsid.simulation import Trajectory, simulate
-from torchfsid.tasks import AffineTask, GoalTask
-from torchfsid.ukf import ParameterUkf, UkfEstimate
+from torchfsid.observers.hybrid import CONDITION, HybridObserver
+from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.observers.ukf import ParameterUkf, UkfEstimate
+from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.bounds import NoiseBound
+from torchfsid.robots.controller import CbfQpController
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.simulation import Trajectory, simulate
+from torchfsid.robots.tasks import AffineTask, GoalTask
+from torchfsid.sets.feasible_set import FeasibleSet
 
 TASK = GoalTask(0.8434)
 BARRIERS = [CollisionAvoidance(ClassK(1.5704), safety_distance=0.3515)]

@@ -10,17 +10,18 @@ import torch
 from torch import Tensor
 
 from tests.logs import bounded_errors, write_config, write_log
-from torchfsid.barriers import ClassK, CollisionAvoidance
 from torchfsid.cli import main
-from torchfsid.controller import CbfQpController
+from torchfsid.config.models import load_models
 from torchfsid.errors import ConfigError
-from torchfsid.feasible_set import FeasibleSet
-from torchfsid.inverse_optimal import NoiseBound
-from torchfsid.measurement import Measurement
-from torchfsid.models import load_models
-from torchfsid.observer import SetMembershipObserver, Status
-from torchfsid.simulation import simulate
-from torchfsid.tasks import AffineTask, GoalTask, OrbitTask, Task, VelocityTask
+from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.outcome import Status
+from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.bounds import NoiseBound
+from torchfsid.robots.controller import CbfQpController
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.simulation import simulate
+from torchfsid.robots.tasks import AffineTask, GoalTask, OrbitTask, Task, VelocityTask
+from torchfsid.sets.feasible_set import FeasibleSet
 
 AVOIDANCE = CollisionAvoidance(ClassK(2.0), safety_distance=0.5, neighbour_velocity="current")
 TASKS: dict[str, Task] = {"orbit": OrbitTask(0.8), "velocity": VelocityTask(), "goal": GoalTask(0.9)}

@@ -14,12 +14,13 @@ import torch
 from torch import Tensor
 
 from tests.problems import CASES, Scene, batch, exact, paper_case, random_scene, rotated, slack, true_thetas
-from torchfsid.clipping import clip
-from torchfsid.critical_region import critical_region
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.inverse_optimal import NoiseBound, inverse_optimal_set
-from torchfsid.polygon import Polygon
+from torchfsid.identification.critical_region import critical_region
+from torchfsid.identification.inverse_optimal import inverse_optimal_set
+from torchfsid.robots.bounds import NoiseBound
+from torchfsid.sets.clipping import clip
+from torchfsid.sets.polygon import Polygon
 
 FAN_EXCESS = 1 / math.cos(math.pi / 16)
 """A disc's polygon of 16 sides reaches this much further."""

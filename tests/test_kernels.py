@@ -11,17 +11,17 @@ import torch
 from torch import Tensor
 
 from tests.problems import CASES, batch, paper_case, random_scene
-from torchfsid.barriers import ClassK, CollisionAvoidance, SpeedPolygon
-from torchfsid.compiled import use_kernel
 from torchfsid.errors import InputError
-from torchfsid.feasible_set import FeasibleSet
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.inverse_optimal import NoiseBound, Uncertainty
-from torchfsid.measurement import Measurement
-from torchfsid.observer import Event, SetMembershipObserver
-from torchfsid.polygon import Polygon, _inscribed_basis
-from torchfsid.reading import Bounds, Model, Reading, read
-from torchfsid.tasks import GoalTask, Saturation
+from torchfsid.identification.evidence import Bounds, Model, Reading, read
+from torchfsid.kernels.compiled import use_kernel
+from torchfsid.observers.set_membership import Event, SetMembershipObserver
+from torchfsid.robots.barriers import ClassK, CollisionAvoidance, SpeedPolygon
+from torchfsid.robots.bounds import NoiseBound, Uncertainty
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.tasks import GoalTask, Saturation
+from torchfsid.sets.feasible_set import FeasibleSet
+from torchfsid.sets.polygon import Polygon, _inscribed_basis
 
 NOISE = NoiseBound(0.02, slack=0.03)
 

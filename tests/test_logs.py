@@ -11,9 +11,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchfsid.barriers import ClassK, CollisionAvoidance
 from torchfsid.errors import LogError
-from torchfsid.logs import Log, read_csv
+from torchfsid.logs.log import Log, read_csv
+from torchfsid.robots.barriers import ClassK, CollisionAvoidance
 
 IRSIM = """t,robot,x,y,vx,vy,radius
 0,0,1,5.1,0.72,-0.009,0.2

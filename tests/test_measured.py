@@ -15,8 +15,8 @@ from experiments.config import SceneConfig
 from experiments.recording import Scene, simulate_scene
 from experiments.sweep_config import load_sweep
 from experiments.teams import TeamConfig
-from torchfsid.feasible_set import FeasibleSet
-from torchfsid.observer import SetMembershipObserver
+from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.sets.feasible_set import FeasibleSet
 
 MONTE_CARLO = Path(__file__).parents[1] / "configs" / "monte_carlo.yaml"
 

@@ -13,11 +13,12 @@ import torch
 from torch import Tensor
 
 from tests.problems import CASES, Scene, batch, paper_case, random_scene, rotated, true_thetas
-from torchfsid.clipping import clip
-from torchfsid.critical_region import critical_region
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.inverse_optimal import NoiseBound, inverse_optimal_set
-from torchfsid.polygon import Polygon
+from torchfsid.identification.critical_region import critical_region
+from torchfsid.identification.inverse_optimal import inverse_optimal_set
+from torchfsid.robots.bounds import NoiseBound
+from torchfsid.sets.clipping import clip
+from torchfsid.sets.polygon import Polygon
 
 BOX = 8.0
 ANGLES = np.linspace(0, 2 * np.pi, 48, endpoint=False) + 0.1

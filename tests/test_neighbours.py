@@ -7,16 +7,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchfsid.barriers import ClassK, CollisionAvoidance
-from torchfsid.controller import CbfQpController
 from torchfsid.errors import InputError
-from torchfsid.feasible_set import FeasibleSet
-from torchfsid.inverse_optimal import NoiseBound
-from torchfsid.measurement import Measurement
-from torchfsid.neighbours import left_out_inactive, nearest_bodies
-from torchfsid.observer import SetMembershipObserver
-from torchfsid.simulation import Trajectory, simulate
-from torchfsid.tasks import GoalTask
+from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.bounds import NoiseBound
+from torchfsid.robots.controller import CbfQpController
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.neighbours import left_out_inactive, nearest_bodies
+from torchfsid.robots.simulation import Trajectory, simulate
+from torchfsid.robots.tasks import GoalTask
+from torchfsid.sets.feasible_set import FeasibleSet
 
 TASK = GoalTask(0.8)
 

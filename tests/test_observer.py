@@ -5,15 +5,16 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchfsid.barriers import ClassK, CollisionAvoidance, SpeedBox
-from torchfsid.controller import CbfQpController
 from torchfsid.errors import InputError
-from torchfsid.feasible_set import FeasibleSet
-from torchfsid.inverse_optimal import NoiseBound
-from torchfsid.measurement import Measurement
-from torchfsid.observer import SetMembershipObserver, Status
-from torchfsid.simulation import Trajectory, simulate
-from torchfsid.tasks import GoalTask
+from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.outcome import Status
+from torchfsid.robots.barriers import ClassK, CollisionAvoidance, SpeedBox
+from torchfsid.robots.bounds import NoiseBound
+from torchfsid.robots.controller import CbfQpController
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.simulation import Trajectory, simulate
+from torchfsid.robots.tasks import GoalTask
+from torchfsid.sets.feasible_set import FeasibleSet
 
 TASK = GoalTask(0.9)
 AVOIDANCE = CollisionAvoidance(ClassK(1.5), safety_distance=0.5)

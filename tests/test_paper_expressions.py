@@ -10,10 +10,10 @@ import torch
 
 from tests.paper_expressions import BOX, Lifted, omega
 from tests.problems import CASES, Scene, paper_case
-from torchfsid.critical_region import critical_region
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.kkt import CASES as LETTERS
-from torchfsid.kkt import solve_kkt
+from torchfsid.identification.critical_region import critical_region
+from torchfsid.identification.kkt import CASES as LETTERS
+from torchfsid.identification.kkt import solve_kkt
 
 MARGIN = 1e-7
 """A theta nearer to a boundary than this is left to round-off (HiGHS is accurate to about 1e-9)."""

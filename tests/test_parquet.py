@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchfsid.errors import LogError
-from torchfsid.logs import Log, read_csv
-from torchfsid.sources import read_log
+from torchfsid.logs.log import Log, read_csv
+from torchfsid.logs.read import read_log
 
 COLUMNS = {
     "t": [0.0, 0.0, 0.1, 0.1],

@@ -27,9 +27,11 @@ from tests.problems import (
     exactly_feasible,
     solve_qp,
 )
-from torchfsid import compiled
-from torchfsid.clipping import Clipped, Outcome, clip, merge
-from torchfsid.polygon import ROUND_OFF, Polygon, round_off
+from torchfsid.kernels import compiled
+from torchfsid.outcome import Outcome
+from torchfsid.sets.clipping import Clipped, clip, merge
+from torchfsid.sets.polygon import Polygon, round_off
+from torchfsid.tolerances import ROUND_OFF
 
 
 @pytest.fixture(scope="module", autouse=True, params=["torch", "compiled"])

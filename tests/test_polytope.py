@@ -13,11 +13,11 @@ from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 from torch import Tensor
 
-from torchfsid import clipping
-from torchfsid.clipping import Outcome
 from torchfsid.errors import SolverError
-from torchfsid.polygon import PRIOR, Polygon
-from torchfsid.polytope import ClippedPolytope, Polytope, clip_polytope, merge_polytope
+from torchfsid.outcome import Outcome
+from torchfsid.sets import clipping
+from torchfsid.sets.polygon import PRIOR, Polygon
+from torchfsid.sets.polytope import ClippedPolytope, Polytope, clip_polytope, merge_polytope
 
 BOX = 10.0
 """Half the side of the boxes that the sets begin with: the size their round-off is measured against."""

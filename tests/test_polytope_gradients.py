@@ -10,17 +10,18 @@ import torch
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
-from torchfsid import clipping
-from torchfsid.barriers import ClassK, CollisionAvoidance
-from torchfsid.controller import CbfQpController
-from torchfsid.feasible_set import FeasibleSet
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.inverse_optimal import NoiseBound
-from torchfsid.observer import SetKind, SetMembershipObserver, Status
-from torchfsid.polygon import Polygon
-from torchfsid.polytope import Polytope, clip_polytope, merge_polytope
-from torchfsid.simulation import simulate
-from torchfsid.tasks import UnknownGainGoalTask
+from torchfsid.observers.set_membership import SetKind, SetMembershipObserver
+from torchfsid.outcome import Status
+from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.bounds import NoiseBound
+from torchfsid.robots.controller import CbfQpController
+from torchfsid.robots.simulation import simulate
+from torchfsid.robots.tasks import UnknownGainGoalTask
+from torchfsid.sets import clipping
+from torchfsid.sets.feasible_set import FeasibleSet
+from torchfsid.sets.polygon import Polygon
+from torchfsid.sets.polytope import Polytope, clip_polytope, merge_polytope
 
 DIMENSIONS = [1, 3, 4]
 

@@ -7,14 +7,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchfsid.barriers import Arena, Barrier, ClassK, CollisionAvoidance, SpeedPolygon
-from torchfsid.controller import CbfQpController
-from torchfsid.feasible_set import FeasibleSet
-from torchfsid.inverse_optimal import NoiseBound
-from torchfsid.measurement import ErrorBounds, Measurement
-from torchfsid.observer import SetMembershipObserver, Status
-from torchfsid.simulation import simulate
-from torchfsid.tasks import GoalTask, OrbitTask, PatrolTask, Saturation, Task, UnknownGainGoalTask, VelocityTask
+from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.outcome import Status
+from torchfsid.robots.barriers import Arena, Barrier, ClassK, CollisionAvoidance, SpeedPolygon
+from torchfsid.robots.bounds import ErrorBounds, NoiseBound
+from torchfsid.robots.controller import CbfQpController
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.simulation import simulate
+from torchfsid.robots.tasks import GoalTask, OrbitTask, PatrolTask, Saturation, Task, UnknownGainGoalTask, VelocityTask
+from torchfsid.sets.feasible_set import FeasibleSet
 
 SATURATIONS = [None, Saturation("norm", (0.5, 0.5), dead_speed=0.03), Saturation("box", (0.5, 0.4))]
 BARRIERS: list[list[Barrier]] = [

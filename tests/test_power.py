@@ -5,14 +5,15 @@ import math
 import pytest
 import torch
 
-from torchfsid.barriers import Barrier, ClassK, CollisionAvoidance, SpeedPolygon
-from torchfsid.controller import CbfQpController
-from torchfsid.feasible_set import FeasibleSet
-from torchfsid.inverse_optimal import NoiseBound
-from torchfsid.measurement import Measurement
-from torchfsid.observer import SetMembershipObserver, Status
-from torchfsid.simulation import simulate
-from torchfsid.tasks import GoalTask, Saturation
+from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.outcome import Status
+from torchfsid.robots.barriers import Barrier, ClassK, CollisionAvoidance, SpeedPolygon
+from torchfsid.robots.bounds import NoiseBound
+from torchfsid.robots.controller import CbfQpController
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.simulation import simulate
+from torchfsid.robots.tasks import GoalTask, Saturation
+from torchfsid.sets.feasible_set import FeasibleSet
 
 GAIN, DELTA, ROBOTS = 0.8, 0.02, 4
 CLIPPED = {

@@ -12,17 +12,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.bag_writer import odometry, pose, write_bag
-from torchfsid.barriers import ClassK, CollisionAvoidance
-from torchfsid.config import ObserveConfig
-from torchfsid.controller import CbfQpController
-from torchfsid.documents import validate
-from torchfsid.logs import Log
-from torchfsid.observation import Observation
-from torchfsid.observer import SetMembershipObserver
-from torchfsid.resampling import Track, log_of_tracks, seconds
-from torchfsid.simulation import Trajectory, simulate
-from torchfsid.sources import read_log
-from torchfsid.tasks import GoalTask
+from torchfsid.commands.observe import Observation
+from torchfsid.config.documents import validate
+from torchfsid.config.observe import ObserveConfig
+from torchfsid.logs.log import Log
+from torchfsid.logs.read import read_log
+from torchfsid.logs.resampling import Track, log_of_tracks, seconds
+from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.controller import CbfQpController
+from torchfsid.robots.simulation import Trajectory, simulate
+from torchfsid.robots.tasks import GoalTask
 
 Motion = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 PERIOD = 0.1

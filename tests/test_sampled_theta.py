@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests.problems import ACTIVE, CASES, Scene, paper_case, random_scene, slack, solve_qp
-from torchfsid.critical_region import critical_region
+from torchfsid.identification.critical_region import critical_region
 
 MARGIN = 1e-7
 """A theta nearer to a half-space's boundary, or a row nearer to its own [m/s], is left to round-off."""

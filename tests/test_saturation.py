@@ -9,10 +9,10 @@ from torch import Tensor
 
 import torchfsid as fsid
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.inverse_optimal import FAN
-from torchfsid.kkt import outward_normals
-from torchfsid.saturation import unclipped
-from torchfsid.tasks import Saturation
+from torchfsid.identification.inverse_optimal import FAN
+from torchfsid.identification.kkt import outward_normals
+from torchfsid.identification.saturation import unclipped
+from torchfsid.robots.tasks import Saturation
 
 CORNERS = torch.tensor([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]], dtype=torch.float64) / 2
 NORM, BOX = Saturation("norm", (0.5, 0.5)), Saturation("box", (0.5, 0.3))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from torchfsid.clipping import Outcome
-from torchfsid.feasible_set import FeasibleSet
 from torchfsid.halfspaces import Halfspaces
+from torchfsid.outcome import Outcome
+from torchfsid.sets.feasible_set import FeasibleSet
 
 Rows = tuple[np.ndarray, np.ndarray]
 

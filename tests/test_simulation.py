@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from torchfsid.active_set import active_set
-from torchfsid.barriers import ClassK, CollisionAvoidance, SpeedBox, stack_barriers
-from torchfsid.controller import CbfQpController
 from torchfsid.errors import InputError
-from torchfsid.simulation import STILL, simulate
-from torchfsid.tasks import GoalTask
+from torchfsid.identification.active_set import active_set
+from torchfsid.robots.barriers import ClassK, CollisionAvoidance, SpeedBox, stack_barriers
+from torchfsid.robots.controller import CbfQpController
+from torchfsid.robots.simulation import STILL, simulate
+from torchfsid.robots.tasks import GoalTask
 
 
 def tensor(*values):

@@ -13,13 +13,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchfsid.barriers import ClassK, CollisionAvoidance, SpeedBox
-from torchfsid.controller import CbfQpController
 from torchfsid.errors import InputError, SolverError
-from torchfsid.measurement import Measurement
-from torchfsid.simulation import Trajectory, simulate
-from torchfsid.tasks import GoalTask, UnknownGainGoalTask, VelocityTask
-from torchfsid.ukf import FLOOR, FilterStatus, ParameterUkf
+from torchfsid.observers.ukf import FLOOR, ParameterUkf
+from torchfsid.outcome import FilterStatus
+from torchfsid.robots.barriers import ClassK, CollisionAvoidance, SpeedBox
+from torchfsid.robots.controller import CbfQpController
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.simulation import Trajectory, simulate
+from torchfsid.robots.tasks import GoalTask, UnknownGainGoalTask, VelocityTask
 
 # Two pairs of obstacles, one pair active until 1.1 s and the other until 2.1 s, then none.
 TASK = GoalTask(1.8605)
@@ -198,7 +199,7 @@ def test_a_solver_that_fails_leaves_the_motion_unknown(monkeypatch: pytest.Monke
         raise SolverError("no solution, no certificate")
 
     with monkeypatch.context() as patch:
-        patch.setattr("torchfsid.ukf.solve_safe_qp", fails)
+        patch.setattr("torchfsid.observers.ukf.solve_safe_qp", fails)
         estimate = ukf.update(second)
     assert estimate.status.item() == FilterStatus.PREDICTED
     torch.testing.assert_close(estimate.theta, before.theta, atol=0, rtol=0)

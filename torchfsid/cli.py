@@ -12,16 +12,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
+from torchfsid.config.models import load_models
 from torchfsid.errors import FsidError
-from torchfsid.models import load_models
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from torchfsid.check import Check
-    from torchfsid.hypotheses import Hypotheses, HypothesisVerdict
-    from torchfsid.observation import Observation
+    from torchfsid.commands.check import Check
+    from torchfsid.commands.hypotheses import Hypotheses, HypothesisVerdict
+    from torchfsid.commands.observe import Observation
 
 USAGE_ERROR, INTERRUPTED = 2, 130
 
@@ -74,9 +74,9 @@ def _observe(log: Path, config: Path, out: Path, overrides: Sequence[str]) -> No
     import torch
     from rich.progress import track
 
-    from torchfsid.hypotheses import Hypotheses
-    from torchfsid.observation import Observation
-    from torchfsid.sources import read_log
+    from torchfsid.commands.hypotheses import Hypotheses
+    from torchfsid.commands.observe import Observation
+    from torchfsid.logs.read import read_log
 
     torch.set_num_threads(1)  # small tensors: more threads only wait for each other
     first = next(iter(models.values()))
@@ -95,10 +95,10 @@ def _check(log: Path, config: Path, out: Path | None, overrides: Sequence[str]) 
 
     import torch
 
-    from torchfsid.check import check
-    from torchfsid.results import write_json
-    from torchfsid.scene import Scene
-    from torchfsid.sources import read_log
+    from torchfsid.commands.check import check
+    from torchfsid.commands.results import write_json
+    from torchfsid.commands.scene import Scene
+    from torchfsid.logs.read import read_log
 
     torch.set_num_threads(1)
     for name, model in models.items():

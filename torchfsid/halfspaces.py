@@ -18,9 +18,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchfsid.errors import InputError
-
-ROUND_OFF = 8 * torch.finfo(torch.float64).eps
-"""Relative error to allow for in a row's product with a point."""
+from torchfsid.tolerances import ROUND_OFF
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,8 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.kkt import CASES
-from torchfsid.layers import ProjectOnto
+from torchfsid.identification.kkt import CASES
+from torchfsid.programmes.layers import ProjectOnto
 
 UNTRAINED = (0.0, 7.0, -3.0)
 """What the network puts out before training: s = 1, r = 0.999, a = 0.05."""

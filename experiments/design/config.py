@@ -13,10 +13,10 @@ from pydantic import Field, model_validator
 
 from experiments.config import Text, WholeNumber
 from experiments.teams import TeamConfig
-from torchfsid.config import AvoidanceConfig, UkfConfig
-from torchfsid.documents import Strict, apply_overrides, read_yaml, validate, wrong
+from torchfsid.config.documents import Strict, apply_overrides, read_yaml, validate, wrong
+from torchfsid.config.observe import AvoidanceConfig, UkfConfig
+from torchfsid.config.quantities import NonNegative, Number, PlanarVector, Positive
 from torchfsid.errors import ConfigError
-from torchfsid.quantities import NonNegative, Number, PlanarVector, Positive
 
 Count = Annotated[int, Field(strict=True, ge=1)]
 Several = Annotated[int, Field(strict=True, ge=2)]

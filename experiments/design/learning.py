@@ -26,9 +26,9 @@ from experiments.design.adaptive import AdaptiveObserver, ConstantGain, NetworkG
 from experiments.design.config import LearnedObserverConfig
 from experiments.design.recordings import Recording, record
 from experiments.design.tables import Track, write_rows
-from torchfsid.documents import dump
-from torchfsid.kkt import CASES
-from torchfsid.results import write_json
+from torchfsid.commands.results import write_json
+from torchfsid.config.documents import dump
+from torchfsid.identification.kkt import CASES
 
 
 def learn(config: LearnedObserverConfig, out: Path, track: Track) -> dict[str, Any]:

@@ -30,8 +30,8 @@ from experiments.design.probe import Probing, along
 from experiments.design.search import METHODS, Evaluated, Search, choose
 from experiments.design.switches import across, summarise_switches
 from experiments.design.tables import Track, write_rows
-from torchfsid.documents import dump
-from torchfsid.results import write_json
+from torchfsid.commands.results import write_json
+from torchfsid.config.documents import dump
 
 SHOWN = ("random", "adam")
 """The methods whose choices are replayed."""

@@ -42,11 +42,12 @@ from torch import Tensor
 
 from experiments.design.config import BoxConfig, ProbePlacementConfig
 from experiments.design.rollout import closed_loop
-from torchfsid.feasible_set import FeasibleSet
-from torchfsid.inverse_optimal import NoiseBound
-from torchfsid.measurement import Measurement
-from torchfsid.observer import SetEstimate, SetMembershipObserver, Status
-from torchfsid.tasks import GoalTask
+from torchfsid.observers.set_membership import SetEstimate, SetMembershipObserver
+from torchfsid.outcome import Status
+from torchfsid.robots.bounds import NoiseBound
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.tasks import GoalTask
+from torchfsid.sets.feasible_set import FeasibleSet
 
 Objective = Literal["area", "log_area"]
 

@@ -17,12 +17,12 @@ from torch import Tensor
 from experiments.design.adaptive import Step
 from experiments.design.config import LearnedObserverConfig
 from experiments.design.rollout import closed_loop
-from torchfsid.feasible_set import FeasibleSet
-from torchfsid.hybrid import HybridObserver
-from torchfsid.inverse_optimal import NoiseBound
-from torchfsid.observer import SetMembershipObserver
-from torchfsid.tasks import GoalTask
-from torchfsid.ukf import ParameterUkf
+from torchfsid.observers.hybrid import HybridObserver
+from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.observers.ukf import ParameterUkf
+from torchfsid.robots.bounds import NoiseBound
+from torchfsid.robots.tasks import GoalTask
+from torchfsid.sets.feasible_set import FeasibleSet
 
 
 @dataclass(frozen=True)

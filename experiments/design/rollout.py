@@ -16,10 +16,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchfsid.barriers import Barrier, stack_barriers
-from torchfsid.layers import ProjectOnto, Status
-from torchfsid.measurement import Measurement
-from torchfsid.tasks import Task
+from torchfsid.outcome import ProgrammeStatus
+from torchfsid.programmes.layers import ProjectOnto
+from torchfsid.robots.barriers import Barrier, stack_barriers
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.tasks import Task
 
 Bodies = Callable[[int, Tensor], Tensor]
 """Where the bodies around each robot are at sample k, given where the robots are: (B, 2) -> (B, m, 2) [m]."""
@@ -51,7 +52,7 @@ def closed_loop(
         C, d = task(before)
         wish = (C @ theta.unsqueeze(-1)).squeeze(-1) + d
         control, status = safe(stack_barriers(barriers, before), wish)
-        feasible = status == Status.OK
+        feasible = status == ProgrammeStatus.OK
         u = torch.where(feasible.unsqueeze(-1), control, 0.0)
         u = u if disturbance is None else u + disturbance[k]
         yield Seen(replace(before, u=u), feasible)

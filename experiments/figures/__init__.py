@@ -16,7 +16,7 @@ from experiments.figures.style import STYLE
 from experiments.figures.swarm import draw_swarm
 from experiments.figures.team import draw_comparison, draw_team
 from experiments.saved import Results
-from torchfsid.documents import load, read_yaml
+from torchfsid.config.documents import load, read_yaml
 
 
 def draw(folder: Path) -> list[Path]:

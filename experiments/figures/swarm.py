@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from experiments.config import SwarmConfig
 from experiments.figures.style import INVERSE_OPTIMAL
-from torchfsid.config import AvoidanceConfig
+from torchfsid.config.observe import AvoidanceConfig
 
 COLOURS = "viridis_r"
 

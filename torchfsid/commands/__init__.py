@@ -1,0 +1,3 @@
+"""What the command line does: observe a log, check it, compare hypotheses, and the results folder and figures they
+leave.
+"""

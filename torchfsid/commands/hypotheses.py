@@ -1,0 +1,105 @@
+"""Which task is it? Several hypotheses about the robots' task, each with a set of its own for every robot.
+
+A hypothesis whose set becomes empty explains nothing any more: it is refuted for that robot, from that time on, by the
+rows that contradict each other. What is left may be true: a log can only ever tell which one is by refuting the others.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from torchfsid.commands.observe import Observation
+from torchfsid.commands.results import STATUS_NAMES, constraint_name, write_json
+from torchfsid.commands.scene import AUTO_FACTOR, Scene, automatic_bound
+from torchfsid.config.observe import ObserveConfig
+from torchfsid.logs.log import Log
+from torchfsid.outcome import Status
+
+
+@dataclass(frozen=True)
+class HypothesisVerdict:
+    """What a log says about one hypothesis for one robot.
+
+    Attributes:
+        status: `ok`, `alarm` or `inconsistent`; the last: refuted.
+        refuted_at: when its set became empty [s]; None: it did not.
+        evidence: the times [s] and rows that contradict each other then; the time of the prior is None.
+        volume: of its set at the end.
+    """
+
+    status: str
+    refuted_at: float | None
+    evidence: tuple[tuple[float | None, str], ...]
+    volume: float
+
+    def to_json(self) -> dict:
+        evidence = [{"time": time, "row": row} for time, row in self.evidence]
+        return {**vars(self), "evidence": evidence}
+
+
+class Hypotheses:
+    """A log and several models by name, ready to run.
+
+    `velocity: auto` takes, for all of them alike, twice the smallest bound with which some hypothesis explains each
+    robot, so that no hypothesis is saved by a bound of its own.
+
+    Raises:
+        ConfigError: see `Scene`; or no bound up to the largest speed lets any hypothesis explain some robot.
+    """
+
+    def __init__(self, models: Mapping[str, ObserveConfig], log: Log):
+        self.smallest_bounds: dict[str, float] | None = None
+        if next(iter(models.values())).noise.velocity == "auto":
+            best: dict[str, float] = {}
+            for model in models.values():
+                for robot, bound in Scene(model, log).smallest_bounds().items():
+                    best[robot] = min(bound, best.get(robot, math.inf))
+            self.smallest_bounds = best
+            bound = automatic_bound(best)
+            models = {name: model.with_velocity_bound(bound) for name, model in models.items()}
+        self.observations = {name: Observation(model, log) for name, model in models.items()}
+
+    @property
+    def samples(self) -> int:
+        """How many samples all hypotheses read together."""
+        return sum(observation.samples for observation in self.observations.values())
+
+    @property
+    def velocity_bound(self) -> float:
+        """The bound in use [m/s]."""
+        return next(iter(self.observations.values())).velocity_bound
+
+    def run(self, out: Path) -> Iterator[float]:
+        """Observe the log with each hypothesis into a folder of its name, yielding the time of each sample done; what
+        came of it goes to hypotheses.json."""
+        for name, observation in self.observations.items():
+            yield from observation.run(out / name)
+        verdicts = {
+            robot: {name: verdict.to_json() for name, verdict in of_robot.items()}
+            for robot, of_robot in self.verdicts().items()
+        }
+        write_json(out / "hypotheses.json", verdicts)
+        if self.smallest_bounds is not None:
+            found = {"smallest": self.smallest_bounds, "factor": AUTO_FACTOR, "used": self.velocity_bound}
+            write_json(out / "velocity_bound.json", found)
+
+    def verdicts(self) -> dict[str, dict[str, HypothesisVerdict]]:
+        """For each robot, what became of each hypothesis. (The leader of a formation keeps no offset to itself.)"""
+        verdicts: dict[str, dict[str, HypothesisVerdict]] = {}
+        for name, observation in self.observations.items():
+            labels, volumes = observation.scene.row_labels, observation.sets.feasible_set.volume().tolist()
+            for i, robot in enumerate(observation.robots):
+                events = [e for e in observation.sets.events if e.robot == i and e.status == Status.INCONSISTENT]
+                rows = events[0].rows if events else ()
+                verdicts.setdefault(robot, {})[name] = HypothesisVerdict(
+                    status=STATUS_NAMES[Status(int(observation.sets.status[i]))],
+                    refuted_at=events[0].t if events else None,
+                    evidence=tuple(
+                        (None if math.isnan(time) else time, constraint_name(source, labels)) for time, source in rows
+                    ),
+                    volume=volumes[i],
+                )
+        return verdicts

@@ -1,0 +1,70 @@
+"""The declared models of an observe file: one, or several that compete for the same log.
+
+    task:  {kind: goal, gain: 0.9}                    one model, or
+    tasks:                                            hypotheses, each with a name, a task and, if need be, a prior
+      - {name: goal, task: {kind: goal, gain: 0.9}}
+      - {task: {kind: velocity}, prior: {lower: [-1, -1], upper: [1, 1]}}
+
+A hypothesis without a name is called by the kind of its task; one without a prior takes that of the file. Everything
+else in the file holds for all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from torchfsid.config.documents import Strict, apply_overrides, read_yaml, validate, wrong
+from torchfsid.config.observe import ObserveConfig, PriorConfig
+from torchfsid.config.tasks import TaskConfig
+from torchfsid.errors import ConfigError
+
+
+class HypothesisConfig(Strict):
+    """A task that the robots may have; `name` becomes the name of a folder."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")] | None = None
+    task: TaskConfig
+    prior: PriorConfig | None = None
+
+    @property
+    def called(self) -> str:
+        return self.name or self.task.kind
+
+
+class _Hypotheses(Strict):
+    tasks: Annotated[tuple[HypothesisConfig, ...], Field(min_length=2)]
+
+    @model_validator(mode="after")
+    def _are_told_apart(self) -> _Hypotheses:
+        names = [hypothesis.called for hypothesis in self.tasks]
+        for i, name in enumerate(names):
+            if name in names[:i]:
+                raise wrong(f"two hypotheses are called '{name}', give them names", "tasks")
+        return self
+
+
+def load_models(path: str | Path, overrides: Iterable[str] = ()) -> dict[str, ObserveConfig]:
+    """The models in the file at `path`, by name, after `overrides`; the only model of a `task` is called "".
+
+    Raises:
+        ConfigError: see `load`; or the file has both `task` and `tasks`, or resets sets that are there to be refuted.
+    """
+    mapping = apply_overrides(read_yaml(path), overrides)
+    source = str(path)
+    if "tasks" not in mapping:
+        return {"": validate(mapping, ObserveConfig, source)}
+    if "task" in mapping:
+        raise ConfigError(f"{source}: tasks: expected task or tasks, got both")
+    common = {key: value for key, value in mapping.items() if key != "tasks"}
+    if common.get("on_inconsistent", "hold") != "hold":
+        raise ConfigError(f"{source}: on_inconsistent: an empty set refutes a hypothesis, so it is 'hold' with tasks")
+    hypotheses = validate({"tasks": mapping["tasks"]}, _Hypotheses, source).tasks
+    models = {}
+    for hypothesis, raw in zip(hypotheses, mapping["tasks"], strict=True):
+        own = {key: raw[key] for key in ("task", "prior") if key in raw}
+        models[hypothesis.called] = validate({**common, **own}, ObserveConfig, f"{source} ({hypothesis.called})")
+    return models

@@ -1,0 +1,159 @@
+"""The tasks in configuration files, and the objects of `tasks` that they stand for."""
+
+from __future__ import annotations
+
+import math
+import reprlib
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from torchfsid.config.documents import Strict, wrong
+from torchfsid.config.quantities import BodyName, NonNegative, Number, PlanarVector, Positive
+from torchfsid.errors import ConfigError
+
+if TYPE_CHECKING:
+    from torchfsid.robots.tasks import Task
+
+
+class NormSaturationConfig(Strict):
+    """|uhat| <= limit [m/s]."""
+
+    kind: Literal["norm"] = "norm"
+    limit: Positive
+
+
+class BoxSaturationConfig(Strict):
+    """|uhat_i| <= limit_i [m/s]."""
+
+    kind: Literal["box"] = "box"
+    limit: PlanarVector
+
+    @model_validator(mode="after")
+    def _is_positive(self) -> BoxSaturationConfig:
+        if min(self.limit) <= 0:
+            raise wrong(f"limits must be greater than 0, got {min(self.limit)}", "limit")
+        return self
+
+
+SaturationConfig = Annotated[NormSaturationConfig | BoxSaturationConfig, Field(discriminator="kind")]
+
+
+class _Task(Strict):
+    @property
+    def parameters(self) -> int:
+        """p, the number of entries of theta."""
+        return 2
+
+
+class GoalConfig(_Task):
+    """`GoalTask`: go to a goal with a known gain [1/s]; clipped; not at all within `dead_zone` of it [m]."""
+
+    kind: Literal["goal"] = "goal"
+    gain: Positive
+    saturation: SaturationConfig | None = None
+    dead_zone: NonNegative = 0.0
+
+    @model_validator(mode="after")
+    def _moves_at_all(self) -> GoalConfig:
+        if min(self._limits) <= self.gain * self.dead_zone:
+            raise wrong(f"at its edge the speed is {self.gain * self.dead_zone}, not below the limit", "dead_zone")
+        return self
+
+    @property
+    def _limits(self) -> tuple[float, float]:
+        if self.saturation is None:
+            return math.inf, math.inf
+        limit = self.saturation.limit
+        return (limit[0], limit[1]) if isinstance(limit, tuple) else (limit, limit)
+
+    def build(self, bodies: Sequence[str]) -> Task:
+        from torchfsid.robots.tasks import GoalTask, Saturation
+
+        if self.saturation is None and self.dead_zone == 0:
+            return GoalTask(self.gain)
+        shape = "norm" if self.saturation is None else self.saturation.kind
+        return GoalTask(self.gain, saturation=Saturation(shape, self._limits, self.gain * self.dead_zone))
+
+
+class UnknownGainGoalConfig(_Task):
+    """`UnknownGainGoalTask`: theta = (k, k x_d)."""
+
+    kind: Literal["goal_unknown_gain"] = "goal_unknown_gain"
+
+    @property
+    def parameters(self) -> int:
+        return 3
+
+    def build(self, bodies: Sequence[str]) -> Task:
+        from torchfsid.robots.tasks import UnknownGainGoalTask
+
+        return UnknownGainGoalTask()
+
+
+class VelocityConfig(_Task):
+    """`VelocityTask`: keep a constant velocity."""
+
+    kind: Literal["velocity"] = "velocity"
+
+    def build(self, bodies: Sequence[str]) -> Task:
+        from torchfsid.robots.tasks import VelocityTask
+
+        return VelocityTask()
+
+
+class FormationConfig(_Task):
+    """`FormationTask`: keep an offset to the body named `leader`, with a known gain [1/s]."""
+
+    kind: Literal["formation"] = "formation"
+    gain: Positive
+    leader: BodyName
+
+    def build(self, bodies: Sequence[str]) -> Task:
+        from torchfsid.robots.tasks import FormationTask
+
+        require_body("task.leader", self.leader, bodies)
+        return FormationTask(self.gain, leader=list(bodies).index(self.leader))
+
+
+class OrbitConfig(_Task):
+    """`OrbitTask`: circle a centre at a known rate [rad/s], positive anticlockwise."""
+
+    kind: Literal["orbit"] = "orbit"
+    rate: Number
+
+    def build(self, bodies: Sequence[str]) -> Task:
+        from torchfsid.robots.tasks import OrbitTask
+
+        return OrbitTask(self.rate)
+
+
+class PatrolConfig(_Task):
+    """`PatrolTask`: follow a closed path of some harmonics of a known rate [rad/s], with a known gain [1/s]."""
+
+    kind: Literal["patrol"] = "patrol"
+    gain: Positive
+    rate: Number
+    harmonics: Annotated[int, Field(strict=True, ge=1)] = 1
+
+    @property
+    def parameters(self) -> int:
+        return 2 + 4 * self.harmonics
+
+    def build(self, bodies: Sequence[str]) -> Task:
+        from torchfsid.robots.tasks import PatrolTask
+
+        return PatrolTask(self.gain, self.rate, self.harmonics)
+
+
+TaskConfig = Annotated[
+    GoalConfig | UnknownGainGoalConfig | VelocityConfig | FormationConfig | OrbitConfig | PatrolConfig,
+    Field(discriminator="kind"),
+]
+
+
+def require_body(path: str, name: str, bodies: Sequence[str]) -> None:
+    """Raises `ConfigError` if the file names, at `path`, a body that is not there."""
+    if name not in bodies:
+        raise ConfigError(f"{path}: no body is called {name!r}; there are {reprlib.repr(list(bodies))}")

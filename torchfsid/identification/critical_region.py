@@ -1,0 +1,54 @@
+r"""The paper's instantaneous feasible set Omega: every theta whose QP has the observed active set (G., Eq. (13)).
+
+    inactive rows:  A_in (G theta + f) <= b_in                   (the paper's strict < is closed, here and only here)
+    multipliers:    C theta + d - (G theta + f)  in  cone{a_j : j active}
+
+One formula for cases A-E (G., Eqs. (19), (29), (44), (47), (54)): the "floating" eta of cases C and E, which is
+quantified by "if there exists eta", is exactly membership in this cone. It does not use the measured control, only
+which rows are active, and equals the critical region of multiparametric quadratic programming.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchfsid.halfspaces import Halfspaces
+from torchfsid.identification.kkt import outward_normals, solve_kkt
+from torchfsid.tolerances import RANK_TOLERANCE
+
+FAN = 3
+"""Normals of a ray: two sides and a cap."""
+
+
+def critical_region(
+    safe_controls: Halfspaces,
+    active: Bool[Tensor, "*batch m"],
+    C: Float[Tensor, "*batch n p"],
+    d: Float[Tensor, "*batch n"],
+) -> Halfspaces:
+    """Omega as half-spaces of theta: rows 0..m-1 keep row j inactive, the last 4 keep the multipliers non-negative.
+
+    Rows that say nothing are padding. `source` is j where row j must stay inactive and m + j where its multiplier must
+    not be negative. Controls are planar (n = 2); p is any.
+    """
+    C, d = C.to(torch.float64), d.to(torch.float64)
+    kkt = solve_kkt(safe_controls, active, C, d)
+    unit = safe_controls.normalised()
+    # A row inside the span of the active rows cannot see theta: u* does not move along it.
+    sees_theta = (unit.A - unit.A @ kkt.projector).square().sum(-1) > RANK_TOLERANCE**2
+    inactive = unit.pullback(kkt.G, kkt.f).where(sees_theta & ~active)
+    inactive = replace(inactive, source=torch.arange(safe_controls.rows, device=active.device))
+
+    # C theta + d - u* = P (C theta + d) - A_a^+ b_a lies in the span of the active rows: normals across it say nothing.
+    normals, generator = outward_normals(unit.A, active, FAN)
+    along = normals @ kkt.projector
+    multipliers = Halfspaces(
+        along @ C,
+        (normals @ kkt.offset.unsqueeze(-1) - along @ d.unsqueeze(-1)).squeeze(-1),
+        safe_controls.rows + generator,
+    ).where(along.square().sum(-1) > RANK_TOLERANCE**2)
+    return Halfspaces.stack([inactive, multipliers])

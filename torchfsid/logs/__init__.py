@@ -1,0 +1,1 @@
+"""Logs that somebody recorded, from CSV, Parquet and ROS bags, as measurements."""

@@ -1,0 +1,228 @@
+r"""Logs that someone recorded, as measurements.
+
+In a table (CSV, Parquet) one row per body and time, the rows of one time together, times increasing, other columns
+ignored:
+
+    t, robot, x, y[, z][, vx, vy[, vz]][, radius]          [s], a name, [m], [m/s], [m]
+
+(vx, vy) is the control computed at t from the positions at t. It is held until the next sample t_+ (zero-order hold):
+where it was not logged, it is (x(t_+) - x(t)) / (t_+ - t), exactly. A body without a row at t is not there at t; if it
+has rows before and after, see `gaps`.
+
+Nothing here imports torch before the measurements are asked for, so that a wrong log is refused at once.
+"""
+
+from __future__ import annotations
+
+import reprlib
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from torchfsid.errors import LogError
+from torchfsid.logs.tables import CsvTable, ParquetTable, Table, require_column
+
+if TYPE_CHECKING:
+    from torchfsid.robots.measurement import Measurement
+
+
+@dataclass(frozen=True)
+class Log:
+    """T times of N bodies. Where something is unknown its entries are zeros, never NaN, and a mask says so.
+
+    Attributes:
+        source: the file.
+        bodies: their names, in the order in which they appear.
+        t: times [s], increasing.
+        x: positions [m].
+        u: velocities [m/s]; None if the log has none.
+        seen: the body is there at t.
+        velocity_known: and so is its velocity.
+        radius: [m]; None if the log has none.
+        position_error, velocity_error: bounds on the errors of x [m] and u [m/s]; None: zero.
+        lost: the body is there at t, but nobody knows where; None: a body that is not seen is not there.
+        bridged: the body was not measured at t, it is where it can be (see `gaps`): itself, it says nothing.
+    """
+
+    source: str
+    bodies: tuple[str, ...]
+    t: Float[np.ndarray, "times"]
+    x: Float[np.ndarray, "times bodies n"]
+    u: Float[np.ndarray, "times bodies n"] | None
+    seen: Bool[np.ndarray, "times bodies"]
+    velocity_known: Bool[np.ndarray, "times bodies"]
+    radius: Float[np.ndarray, "bodies"] | None = None
+    position_error: Float[np.ndarray, "times bodies"] | None = None
+    velocity_error: Float[np.ndarray, "times bodies"] | None = None
+    lost: Bool[np.ndarray, "times bodies"] | None = None
+    bridged: Bool[np.ndarray, "times bodies"] | None = None
+
+    @property
+    def previous_known(self) -> Bool[np.ndarray, "times bodies"]:
+        """The body's velocity one sample earlier is known; so not at the first sample, nor at a body's first."""
+        return _one_earlier(self.velocity_known)
+
+    def differentiated(self) -> Log:
+        """The log with velocities from differences of its positions (module docstring), without its last time.
+
+        The velocity of a body that is missing from the next sample is not known.
+
+        Raises:
+            LogError: a difference quotient is not a finite number.
+        """
+        known = self.seen[:-1] & self.seen[1:]
+        with np.errstate(over="ignore", invalid="ignore"):
+            u = np.where(known[..., None], np.diff(self.x, axis=0) / np.diff(self.t)[:, None, None], 0.0)
+        if not np.isfinite(u).all():
+            k = int(np.argmin(np.isfinite(u).all(axis=(1, 2))))
+            raise LogError(f"{self.source}: no finite velocities from t = {self.t[k]} to {self.t[k + 1]}")
+        return replace(self, t=self.t[:-1], x=self.x[:-1], u=u, seen=self.seen[:-1], velocity_known=known)
+
+    def measurements(
+        self, robots: Sequence[str], neighbour_velocities: Collection[str], required: Collection[str] = ()
+    ) -> Iterator[Measurement]:
+        """One measurement per time, of the batch of these robots among all bodies.
+
+        A robot is `observed` where its velocity is known, the `required` bodies (the leader of a formation) are there,
+        and the `neighbour_velocities` that its barriers use are known: for `current` the velocity of every body that is
+        there, for `previous` that of every body that is there (the robot included) one sample earlier. A row with an
+        unknown right-hand side cannot just be left out: it may be the active one, and the set would lose the truth. For
+        the same reason no robot is observed while a body is `lost`. A body that is `bridged` serves others only.
+
+        Raises:
+            LogError: the log has no velocities, or no body of that name.
+        """
+        if self.u is None:
+            raise LogError(f"{self.source}: no velocities (vx, vy): take `velocity: differentiated`, or log them")
+        if missing := [name for name in (*robots, *required) if name not in self.bodies]:
+            raise LogError(f"{self.source}: no body is called {missing[0]!r}; there are {reprlib.repr(self.bodies)}")
+        index, leaders = ([self.bodies.index(name) for name in names] for names in (robots, required))
+        observed = self.velocity_known[:, index] & self.seen[:, leaders].all(axis=1, keepdims=True)
+        if "current" in neighbour_velocities:
+            observed &= (self.velocity_known | ~self.seen).all(axis=1, keepdims=True)
+        if "previous" in neighbour_velocities:
+            observed &= (self.previous_known | ~self.seen).all(axis=1, keepdims=True)
+        if self.lost is not None:
+            observed &= ~self.lost.any(axis=1, keepdims=True)
+        if self.bridged is not None:
+            observed &= ~self.bridged[:, index]
+        neighbour_error = self.velocity_error
+        if neighbour_error is not None and "previous" in neighbour_velocities:  # one bound serves both moments
+            neighbour_error = np.maximum(neighbour_error, _one_earlier(neighbour_error))
+        return self._measurements(self.u, index, observed, neighbour_error)
+
+    def _measurements(
+        self, velocities: np.ndarray, robots: list[int], observed: np.ndarray, neighbour_error: np.ndarray | None
+    ) -> Iterator[Measurement]:
+        import torch
+
+        from torchfsid.robots.measurement import Measurement
+
+        x, u, seen, observes = (torch.from_numpy(array) for array in (self.x, velocities, self.seen, observed))
+        previous_u = torch.from_numpy(_one_earlier(velocities))
+        radius, x_error, u_error, bodies_u_error = (
+            None if array is None else torch.from_numpy(array)
+            for array in (self.radius, self.position_error, self.velocity_error, neighbour_error)
+        )
+        for k, t in enumerate(self.t.tolist()):
+            team = Measurement.of_team(
+                t,
+                x[k],
+                u[k],
+                robots=robots,
+                previous_u=previous_u[k],
+                radius=radius,
+                seen=seen[k],
+                position_error=None if x_error is None else x_error[k],
+                velocity_error=None if u_error is None else u_error[k],
+            )
+            if bodies_u_error is not None:
+                team = replace(team, body_velocity_error=bodies_u_error[k].expand_as(team.present))
+            yield replace(team, observed=observes[k])
+
+
+def _one_earlier(values: np.ndarray) -> np.ndarray:
+    """The values of the sample before; zeros before the first."""
+    return np.concatenate([np.zeros_like(values[:1]), values[:-1]])
+
+
+def read_csv(path: str | Path) -> Log:
+    """The log in a CSV file (UTF-8, one header line).
+
+    Raises:
+        LogError: the file cannot be read, or is not such a log; the message names the line, and the column.
+    """
+    return _log_in(CsvTable(str(path)))
+
+
+def read_parquet(path: str | Path) -> Log:
+    """The log in a Parquet file, of the same columns. Needs the extra `parquet`.
+
+    Raises:
+        LogError: the file cannot be read, or is not such a log; the message names the row, and the column.
+    """
+    return _log_in(ParquetTable(str(path)))
+
+
+def _log_in(table: Table) -> Log:
+    axes = [axis for axis in "xyz" if axis in "xy" or axis in table.header]
+    velocities = [f"v{axis}" for axis in "xyz" if f"v{axis}" in table.header]
+    for name in ["t", "robot", *axes, *(f"v{axis}" for axis in axes if velocities)]:
+        require_column(table, name)
+    if "z" not in axes and "vz" in velocities:
+        raise table.header_error("column 'vz' without 'z'")
+
+    t = table.numbers("t")
+    steps = np.diff(t)
+    if (steps < 0).any():
+        i = int(np.argmax(steps < 0))
+        raise table.error(i + 1, f"times must not decrease, got {t[i + 1]} after {t[i]}")
+    if not (steps > 0).any():
+        raise table.error(len(t) - 1, f"the log ends after a single time, t = {t[0]}")
+    time = np.concatenate([[0], np.cumsum(steps > 0)])
+
+    names = table.names("robot")
+    bodies = tuple(dict.fromkeys(names))
+    slot = {name: j for j, name in enumerate(bodies)}
+    body = np.fromiter((slot[name] for name in names), dtype=np.int64, count=len(names))
+    cell = time * len(bodies) + body
+    order = np.argsort(cell, kind="stable")
+    repeats = np.flatnonzero(np.diff(cell[order]) == 0)
+    if len(repeats):
+        i = int(order[repeats + 1].min())
+        raise table.error(i, f"robot {names[i]!r} has another row at t = {t[i]}")
+
+    def by_time_and_body(columns: list[str]) -> np.ndarray:
+        values = np.zeros((time[-1] + 1, len(bodies), len(columns)))
+        values[time, body] = np.stack([table.numbers(column) for column in columns], axis=-1)
+        return values
+
+    seen = np.zeros((time[-1] + 1, len(bodies)), dtype=bool)
+    seen[time, body] = True
+    return Log(
+        source=table.source,
+        bodies=bodies,
+        t=t[np.concatenate([[True], steps > 0])],
+        x=by_time_and_body(axes),
+        u=by_time_and_body(velocities) if velocities else None,
+        seen=seen,
+        velocity_known=seen if velocities else np.zeros_like(seen),
+        radius=_radius(table, names, body) if "radius" in table.header else None,
+    )
+
+
+def _radius(table: Table, names: list[str], body: np.ndarray) -> Float[np.ndarray, "bodies"]:
+    values = table.numbers("radius")
+    if (values < 0).any():
+        i = int(np.argmax(values < 0))
+        raise table.error(i, f"column 'radius': expected a number >= 0, got {values[i]}")
+    radius = values[np.unique(body, return_index=True)[1]]
+    changed = values != radius[body]
+    if changed.any():
+        i = int(np.argmax(changed))
+        raise table.error(i, f"the radius of robot {names[i]!r} changes from {radius[body[i]]} to {values[i]}")
+    return radius

@@ -1,0 +1,29 @@
+"""Where logs come from: what a path is, decides how it is read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from torchfsid.config.bags import BagConfig
+from torchfsid.errors import ConfigError, LogError
+from torchfsid.logs.bags import read_bag
+from torchfsid.logs.log import Log, read_csv, read_parquet
+
+
+def read_log(path: str | Path, bag: BagConfig | None = None) -> Log:
+    """The log at `path`: a rosbag2 folder, .mcap, .db3, .parquet, and whatever is called otherwise as CSV.
+
+    Raises:
+        LogError: it cannot be read, or is not what its name says.
+        ConfigError: it is a ROS bag, and `bag` does not say where the bodies are in it, or wrongly.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    is_folder = path.is_dir()
+    if is_folder and not (path / "metadata.yaml").exists():
+        raise LogError(f"{path}: cannot be read: a folder without metadata.yaml is not a ROS bag")
+    if is_folder or suffix in (".mcap", ".db3"):
+        if bag is None:
+            raise ConfigError("bag: required to read a ROS bag, e.g. bag: {topics: {/r1/odom: r1, /r2/odom: r2}}")
+        return read_bag(path, bag)
+    return read_parquet(path) if suffix == ".parquet" else read_csv(path)

@@ -1,0 +1,206 @@
+r"""Bodies that were measured at different times, on one clock, with bounds on what that does.
+
+Between two consecutive samples of a body, h seconds apart, at s_k + l h with 0 <= l <= 1,
+
+    x = (1 - l) x_k + l x_{k+1}       error <= l (1 - l) h V
+    u = (1 - l) u_k + l u_{k+1}       error <= 2 l (1 - l) V
+
+Assumption: between two samples the velocity changes by no more than V, the largest change of velocity that the samples
+around show: from one sample to the next in this interval and the two beside it, and from them to the mean velocity
+(x_{k+1} - x_k) / h. For u also: no faster than V / h, i.e. (vx, vy) at t is, as in every log, the command for the
+positions at t, which move on continuously even where a command is held. Both errors vanish at samples.
+
+Proof: with m, m' the mean velocities before and after, x(t) = x_k + l h m and x_{k+1} - x_k = h (l m + (1 - l) m'), so
+the error of x is l (1 - l) h (m - m'), and |m - m'| <= V. And |u(t) - u_k| <= l V, |u(t) - u_{k+1}| <= (1 - l) V.
+
+A body without logged velocities has only those means: its V is the sum of the mean's changes to the interval before and
+to the one after, where it has both. Taken as velocities (`differentiated`), the means have an error of at most V, also
+at the samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from torchfsid.errors import LogError
+from torchfsid.logs.log import Log
+
+MAX_GAP = 2.5
+"""Median periods that a body's samples may lie apart to be joined: one message may be lost, not two."""
+
+MIN_RUN = 3
+"""Intervals without a gap that it takes to judge how a velocity changes."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """One body's own samples.
+
+    Attributes:
+        body: its name.
+        stamps: increasing [ns].
+        x: positions [m].
+        u: velocities [m/s]; None if not measured.
+    """
+
+    body: str
+    stamps: Int[np.ndarray, "samples"]
+    x: Float[np.ndarray, "samples 2"]
+    u: Float[np.ndarray, "samples 2"] | None
+
+
+@dataclass(frozen=True)
+class ResampledLog(Log):
+    """A log whose bodies were measured at other times than its own. A body that is not seen is lost, not gone."""
+
+    tracks: tuple[Track, ...] = ()
+    clock: Int[np.ndarray, "times"] | None = None
+
+    def differentiated(self) -> Log:
+        """The log with velocities from differences of the bodies' own samples (module docstring)."""
+        assert self.clock is not None
+        positions = [replace(track, u=None) for track in self.tracks]
+        return _resampled(self.source, positions, self.clock, self.radius, differentiate=True)
+
+
+def log_of_tracks(
+    source: str,
+    tracks: Sequence[Track],
+    clock: Int[np.ndarray, "times"] | None,
+    radius: Float[np.ndarray, "bodies"] | None,
+) -> Log:
+    """The tracks as a log, as they are where all have the same stamps, otherwise on `clock` [ns] (default: the stamps
+    of the first).
+
+    Raises:
+        LogError: at no time of the clock is every body known.
+    """
+    first = tracks[0]
+    if not all(np.array_equal(track.stamps, first.stamps) for track in tracks):
+        return _resampled(source, tracks, first.stamps if clock is None else clock, radius, differentiate=False)
+    seen = np.ones((len(first.stamps), len(tracks)), dtype=bool)
+    with_velocity = [track.u is not None for track in tracks]
+    u = np.stack([np.zeros_like(track.x) if track.u is None else track.u for track in tracks], axis=1)
+    return Log(
+        source=source,
+        bodies=tuple(track.body for track in tracks),
+        t=seconds(first.stamps),
+        x=np.stack([track.x for track in tracks], axis=1),
+        u=u if any(with_velocity) else None,
+        seen=seen,
+        velocity_known=seen & np.array(with_velocity),
+        radius=radius,
+    )
+
+
+def seconds(stamps: Int[np.ndarray, "times"]) -> Float[np.ndarray, "times"]:
+    """[ns] to [s], rounded once: the stamp of a time that was written as a decimal gives back that time."""
+    return np.array([stamp / 1_000_000_000 for stamp in stamps.tolist()])
+
+
+class _Samples(NamedTuple):
+    """One body on the clock; zeros where not seen, or its velocity not known."""
+
+    x: Float[np.ndarray, "times 2"]
+    u: Float[np.ndarray, "times 2"]
+    seen: Bool[np.ndarray, "times"]
+    velocity_known: Bool[np.ndarray, "times"]
+    position_error: Float[np.ndarray, "times"]
+    velocity_error: Float[np.ndarray, "times"]
+
+
+def _resampled(
+    source: str,
+    tracks: Sequence[Track],
+    clock: Int[np.ndarray, "times"],
+    radius: Float[np.ndarray, "bodies"] | None,
+    differentiate: bool,
+) -> ResampledLog:
+    of_each = [_sample(track, clock, differentiate) for track in tracks]
+    bodies = _Samples(*(np.stack(of_bodies, axis=1) for of_bodies in zip(*of_each, strict=True)))
+    if not bodies.seen.all(axis=1).any():
+        raise LogError(f"{source}: at no time of the clock are all bodies known: {_spans(tracks)}")
+    return ResampledLog(
+        source=source,
+        bodies=tuple(track.body for track in tracks),
+        t=seconds(clock),
+        x=bodies.x,
+        u=bodies.u if bodies.velocity_known.any() else None,
+        seen=bodies.seen,
+        velocity_known=bodies.velocity_known,
+        radius=radius,
+        position_error=bodies.position_error,
+        velocity_error=bodies.velocity_error,
+        lost=~bodies.seen,
+        tracks=tuple(tracks),
+        clock=clock,
+    )
+
+
+def _spans(tracks: Sequence[Track]) -> str:
+    spans = (seconds(track.stamps[[0, -1]]) for track in tracks)
+    return ", ".join(
+        f"{track.body!r} from {start} to {end} s" for track, (start, end) in zip(tracks, spans, strict=True)
+    )
+
+
+def _sample(track: Track, clock: Int[np.ndarray, "times"], differentiate: bool) -> _Samples:
+    stamps, periods = track.stamps, np.diff(track.stamps)
+    interval = np.clip(np.searchsorted(stamps, clock, side="right") - 1, 0, len(periods) - 1)
+    after = (clock - stamps[interval]) / periods[interval]
+    weight = np.clip(after * (1 - after), 0.0, None)
+    at_sample = (after == 0) | (after == 1)
+    change = _change_of_velocity(track)
+    joined = np.isfinite(change[interval]) & (after > 0) & (after < 1)
+    seen = joined | at_sample
+    bound = np.where(np.isfinite(change[interval]), change[interval], 0.0)
+
+    def at_clock(values: np.ndarray, known: np.ndarray) -> np.ndarray:
+        mean = (1 - after)[:, None] * values[interval] + after[:, None] * values[interval + 1]
+        return np.where(known[:, None], mean, 0.0)
+
+    if differentiate:
+        known = (after >= 0) & (after < 1) & np.isfinite(change[interval])
+        u, u_error = np.where(known[:, None], _mean_velocities(track)[interval], 0.0), bound
+    else:
+        known = seen if track.u is not None else np.zeros_like(seen)
+        u = np.zeros((len(clock), 2)) if track.u is None else at_clock(track.u, known)
+        u_error = 2 * weight * bound
+    return _Samples(
+        x=at_clock(track.x, seen),
+        u=u,
+        seen=seen,
+        velocity_known=known,
+        position_error=np.where(joined, weight * periods[interval] * 1e-9 * bound, 0.0),
+        velocity_error=np.where(known, u_error, 0.0),
+    )
+
+
+def _mean_velocities(track: Track) -> Float[np.ndarray, "intervals 2"]:
+    with np.errstate(over="ignore"):
+        return np.diff(track.x, axis=0) / (np.diff(track.stamps) * 1e-9)[:, None]
+
+
+def _change_of_velocity(track: Track) -> Float[np.ndarray, "intervals"]:
+    """V of each interval between samples [m/s]; NaN in gaps, and where too few samples follow each other."""
+    periods, means = np.diff(track.stamps), _mean_velocities(track)
+    change = np.full(len(periods), np.nan)
+    joined = np.flatnonzero(periods <= MAX_GAP * np.median(periods))
+    runs = [run for run in np.split(joined, np.flatnonzero(np.diff(joined) > 1) + 1) if len(run) >= MIN_RUN]
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is no bound
+        if track.u is None:
+            to_next = np.linalg.norm(np.diff(means, axis=0), axis=1)
+            for run in runs:
+                change[run[1:-1]] = to_next[run[:-2]] + to_next[run[1:-1]]
+        else:
+            seen = [track.u[1:] - track.u[:-1], means - track.u[:-1], means - track.u[1:]]
+            inside = np.linalg.norm(seen, axis=-1).max(axis=0)
+            for run in runs:
+                of_three = np.lib.stride_tricks.sliding_window_view(inside[run], MIN_RUN).max(axis=-1)
+                change[run] = of_three[np.clip(np.arange(len(run)) - 1, 0, len(run) - MIN_RUN)]
+    return change

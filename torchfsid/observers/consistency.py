@@ -1,0 +1,201 @@
+r"""How large the errors must be for a log to fit its declared model, whatever the truth is.
+
+    delta_i = min { delta : the sets of robot i's samples with velocity bound delta share a point of the prior }
+
+A set grows with its bound, so bisection finds delta_i; below it no parameter explains robot i. A hard row that is
+violated by more than its bound is a contradiction too, if `slack` follows `velocity`. The residual of one sample is the
+same with that sample alone, and with a given Theta for the prior.
+
+Unlike an observer, this knows the whole log: many samples are read at once, each against everything known so far, again
+and again while that shrinks Theta (it can, if the nominal control is clipped). So the sets are never larger than the
+observer's, and an observer with bound delta_i finds no contradiction but by the round-off of what it leaves out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchfsid.halfspaces import Halfspaces
+from torchfsid.observers.set_membership import Reading, SetMembershipObserver
+from torchfsid.robots.barriers import Barrier
+from torchfsid.robots.bounds import ErrorBounds, NoiseBound
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.tasks import Affine, Saturation, Task
+from torchfsid.sets.feasible_set import FeasibleSet
+
+RESOLUTION = 1.02
+"""A bound that is found is at most this factor too large."""
+
+SMALLEST = 1e-9
+"""Bounds below this are not told apart [m/s]."""
+
+BLOCK = 64
+"""Samples read at once."""
+
+SHRUNK = 0.9
+"""Samples are read again while that leaves less than this fraction of some robot's Theta."""
+
+
+@dataclass(frozen=True)
+class _Evaluated:
+    """A task whose (C, d) are known: it may depend on the time, and a block of samples has many."""
+
+    task: Task
+    affine: Affine
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        return self.task.parameter_names
+
+    @property
+    def saturation(self) -> Saturation | None:
+        return self.task.saturation
+
+    def __call__(self, measurement: Measurement) -> Affine:
+        return self.affine
+
+    def drift(self, bounds: ErrorBounds, largest: Float[Tensor, "*batch p"]) -> Float[Tensor, "*batch"]:
+        return self.task.drift(bounds, largest)
+
+
+@dataclass(frozen=True)
+class Block:
+    """Some samples of all robots as one batch, sample by sample."""
+
+    times: Float[Tensor, "samples"]
+    task: _Evaluated
+    measurement: Measurement
+
+    def repeated(self, of_robots: Tensor) -> Tensor:
+        """What is known of each robot, for each of its samples."""
+        return of_robots.repeat(len(self.times), *[1] * (of_robots.ndim - 1))
+
+
+class Consistency:
+    """A log, read as samples of robots that share a task and barriers.
+
+    Args:
+        measurements: in the order of time, all of the same robots.
+        prior: the robots' prior sets, batch (B,).
+        slack: a bound of its own for the slack; None: that of the velocity.
+        position, neighbour_velocity: see `NoiseBound`.
+    """
+
+    def __init__(
+        self,
+        measurements: Sequence[Measurement],
+        task: Task,
+        barriers: Sequence[Barrier],
+        prior: FeasibleSet,
+        slack: float | None = None,
+        position: float = 0.0,
+        neighbour_velocity: float = 0.0,
+    ):
+        self.barriers, self.prior, self.slack = barriers, prior, slack
+        self.position, self.neighbour_velocity = position, neighbour_velocity
+        self.robots = prior.batch_shape[0]
+        blocks = [measurements[k : k + BLOCK] for k in range(0, len(measurements), BLOCK)]
+        self.blocks = [_block(samples, task) for samples in blocks]
+        self.fastest = max(float(sample.u.norm(dim=-1).max()) for sample in measurements if sample.u is not None)
+
+    def smallest_bounds(self, largest: float) -> Float[Tensor, "B"]:
+        """delta_i of every robot [m/s], at most by `RESOLUTION` too large; infinite if it is above `largest`."""
+        high = torch.full((self.robots,), largest, dtype=torch.float64)
+        possible = self.sets(high)[1]
+        low = torch.full_like(high, min(SMALLEST, largest))
+        high = torch.where(self.sets(low)[1], low, high)
+        while bool((high > low * RESOLUTION)[possible].any()):
+            middle = (low * high).sqrt()
+            fits = self.sets(middle, possible)[1]
+            low, high = torch.where(fits, low, middle), torch.where(fits, middle, high)
+        return torch.where(possible, high, math.inf)
+
+    def sets(
+        self, velocity: Float[Tensor, "B"], wanted: Bool[Tensor, "B"] | None = None
+    ) -> tuple[FeasibleSet, Bool[Tensor, "B"]]:
+        """Theta of every robot with its own velocity bound [m/s], and whether it is free of contradictions.
+
+        It stops as soon as all the `wanted` robots (default: all) are contradicted.
+        """
+        wanted = torch.ones(self.robots, dtype=torch.bool) if wanted is None else wanted
+        theta, fits = self.prior, torch.ones(self.robots, dtype=torch.bool)
+        while True:
+            before = theta.volume()
+            for block in self.blocks:
+                reading = self.read(block, theta, block.repeated(velocity))
+                if self.slack is None:
+                    fits = fits & ~self._by_robot(reading.alarmed).any(0)
+                rows = reading.omega
+                A, b = self._by_robot(rows.A).transpose(0, 1).flatten(1, 2), self._by_robot(rows.b).transpose(0, 1)
+                narrowed = theta.intersect(Halfspaces(A, b.flatten(1, 2)))
+                fits = fits & ~narrowed.is_empty
+                theta = narrowed.where(~narrowed.is_empty, theta)
+                if not bool((fits & wanted).any()):
+                    return theta, fits
+            if self.blocks[0].task.saturation is None or bool((theta.volume() >= SHRUNK * before)[fits & wanted].all()):
+                return theta, fits
+
+    def residuals(self, theta: FeasibleSet, largest: float) -> Float[Tensor, "samples B"]:
+        """The smallest bound with which a sample's own set meets Theta [m/s]; NaN where it says nothing, and infinite
+        above `largest`."""
+        found = []
+        for block in self.blocks:
+            items = len(block.times) * self.robots
+            high = torch.full((items,), largest, dtype=torch.float64)
+            low = torch.full_like(high, min(SMALLEST, largest))
+            possible, says = self._meets(block, theta, high)
+            high = torch.where(self._meets(block, theta, low)[0], low, high)
+            while bool((high > low * RESOLUTION)[possible].any()):
+                middle = (low * high).sqrt()
+                meets, _ = self._meets(block, theta, middle)
+                low, high = torch.where(meets, low, middle), torch.where(meets, middle, high)
+            found.append(self._by_robot(torch.where(possible, high, math.inf).where(says, math.nan)))
+        return torch.cat(found)
+
+    def read(self, block: Block, theta: FeasibleSet, velocity: Float[Tensor, "items"]) -> Reading:
+        """What a block of samples says, each item with its velocity bound, while Theta is known."""
+        items = block.repeated(torch.arange(self.robots))
+        noise = NoiseBound(
+            velocity,
+            None if self.slack is None else torch.full_like(velocity, self.slack),
+            self.position,
+            self.neighbour_velocity,
+        )
+        return SetMembershipObserver(block.task, self.barriers, theta.select(items), noise=noise).read(
+            block.measurement
+        )
+
+    def _meets(
+        self, block: Block, theta: FeasibleSet, velocity: Float[Tensor, "items"]
+    ) -> tuple[Bool[Tensor, "items"], Bool[Tensor, "items"]]:
+        """Does each sample's set meet Theta, and was the sample measured at all?"""
+        reading = self.read(block, theta, velocity)
+        items = block.repeated(torch.arange(self.robots))
+        meets = ~theta.select(items).intersect(reading.omega).is_empty
+        if self.slack is None:
+            meets = meets & ~reading.alarmed
+        return meets, reading.informative | reading.alarmed
+
+    def _by_robot(self, items: Tensor) -> Tensor:
+        return items.unflatten(0, (-1, self.robots))
+
+
+def _block(samples: Sequence[Measurement], task: Task) -> Block:
+    def joined(name: str) -> Any:
+        values = [getattr(sample, name) for sample in samples]
+        return None if values[0] is None else torch.cat(values)
+
+    C, d = zip(*(task(sample) for sample in samples), strict=True)
+    together = {field.name: joined(field.name) for field in fields(Measurement) if field.name != "t"}
+    return Block(
+        times=torch.tensor([sample.t for sample in samples], dtype=torch.float64),
+        task=_Evaluated(task, (torch.cat(C), torch.cat(d))),
+        measurement=Measurement(t=samples[0].t, **together),
+    )

@@ -1,0 +1,335 @@
+r"""The point estimator that the sets are compared with: an unscented Kalman filter on [x; theta] (G., Secs. II-A, VII).
+
+    x(t + dt) = x(t) + dt (G theta + f) + w_x,   theta(t + dt) = theta(t) + w_theta,   z = x + v
+
+Between two measurements the robot moves with the (G, f) of the active set observed at the earlier one, so the model is
+linear and the filter is a Kalman filter. While two independent rows are active G = 0: it learns nothing. With
+`qp_inside` the velocity is the solution of the safety QP at each sigma point instead: which rows are active then
+depends on theta, the filter learns earlier, and believes itself far too much (its covariance is a local one).
+
+What can go wrong with data is reported, never raised:
+    - a robot was not seen, or the motion that followed a measurement cannot be read off it (a neighbour's velocity is
+      not known, a row is violated, the controller failed): the next position says nothing about theta. It starts the
+      position afresh, theta's mean stays, its covariance grows by the drift. Holding the last (G, f) instead would feed
+      the filter a motion that nobody has observed;
+    - the covariance is no longer positive definite (round-off): its eigenvalues, measured in prior and position noise,
+      are raised to `DEFINITE` times the largest. It only grows, so the filter never claims to know more than before.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter, unscented_transform
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchfsid.errors import InputError, SolverError
+from torchfsid.halfspaces import Halfspaces
+from torchfsid.identification.active_set import active_set
+from torchfsid.identification.kkt import solve_kkt
+from torchfsid.outcome import FilterStatus
+from torchfsid.robots.barriers import Barrier, controller_failed, stack_barriers
+from torchfsid.robots.controller import solve_safe_qp
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.tasks import Saturation, Task
+from torchfsid.tolerances import ACTIVE_TOLERANCE
+
+FLOOR = 1e-8
+"""Noises per step are at least this fraction of the position noise (x) and of the prior's spread (theta)."""
+
+DEFINITE = 1e-13
+"""A repaired covariance's smallest eigenvalue over its largest: a little more than a Cholesky factorisation needs."""
+
+FARTHEST = 1e100
+"""A position beyond this is no measurement [m]: its square would overflow."""
+
+SIGMA_POINTS = {"alpha": 1.0, "beta": 2.0, "kappa": 0.0}
+"""No weight is negative, so that a prediction stays positive definite; alpha < 0.1 loses digits to cancellation."""
+
+Array = np.ndarray
+Motion = Callable[[Array], Array]
+"""Velocities (S, n) [m/s] as a function of parameters (S, p)."""
+
+
+@dataclass(frozen=True)
+class UkfEstimate:
+    """What the filters believe at time t.
+
+    Attributes:
+        t: time [s].
+        theta, covariance: mean and covariance of theta.
+        status: a `FilterStatus` per robot, about this measurement alone.
+    """
+
+    t: float
+    theta: Float[Tensor, "B p"]
+    covariance: Float[Tensor, "B p p"]
+    status: Int[Tensor, "B"]
+
+
+@dataclass
+class ParameterUkf:
+    """One unscented Kalman filter on [x; theta] for each of B robots that share a task and barriers.
+
+    Attributes:
+        task, barriers: the declared model.
+        mean: theta's prior mean.
+        spread: standard deviation of theta's prior, one number, one per parameter, or one per robot and parameter.
+        position_noise: standard deviation of a measured position [m]; R is its square.
+        process_noise: standard deviation of theta's drift [units of theta per sqrt(s)].
+        motion_noise: standard deviation of what the model's motion leaves out [m/sqrt(s)]. The default allows, at a
+            step of 0.02 s, for a velocity that is off by 7e-3 m/s, as those of inexact solvers are.
+        active_tolerance: distance to its boundary below which a row counts as active; a row violated by more makes
+            the motion unknown [m/s].
+        qp_inside: solve the QP at every sigma point.
+        filters: filterpy's filter for each robot; None while its position or its motion is not known.
+
+    Raises:
+        InputError: `mean` is not (B, p), `spread` does not fit it, or a spread or noise is not positive (drift and
+            motion noise may be zero).
+    """
+
+    task: Task
+    barriers: Sequence[Barrier]
+    mean: Float[Tensor, "B p"]
+    spread: float | Float[Tensor, "*robots p"]
+    position_noise: float = 1e-3
+    process_noise: float = 1e-4
+    motion_noise: float = 1e-3
+    active_tolerance: float = ACTIVE_TOLERANCE
+    qp_inside: bool = False
+    filters: list[UnscentedKalmanFilter | None] = field(init=False)
+
+    def __post_init__(self) -> None:
+        p = len(self.task.parameter_names)
+        if self.mean.ndim != 2 or self.mean.shape[-1] != p or not bool(self.mean.isfinite().all()):
+            raise InputError("mean", f"finite means (B, {p})", self.mean)
+        spread = torch.as_tensor(self.spread, dtype=torch.float64).detach()
+        if not bool((spread > 0).all() & spread.isfinite().all()):
+            raise InputError("spread", "positive standard deviations", self.spread)
+        try:
+            self._scale = spread.expand(self.mean.shape).numpy()
+        except RuntimeError as error:
+            raise InputError("spread", f"a shape that fits {tuple(self.mean.shape)}", tuple(spread.shape)) from error
+        noises = (self.position_noise, self.process_noise, self.motion_noise, self.active_tolerance)
+        positive = self.position_noise > 0 and self.active_tolerance > 0
+        if not (positive and min(noises) >= 0 and math.isfinite(sum(noises))):
+            raise InputError("noises", "position_noise > 0, active_tolerance > 0, the others >= 0", noises)
+        self._theta = self.mean.detach().to(torch.float64).numpy().copy()
+        self._covariance = self._scale[:, :, None] ** 2 * np.eye(p)
+        self.filters = [None] * len(self.mean)
+        self._motions: list[Motion | None] = [None] * len(self.mean)
+        self._t = -math.inf
+
+    @classmethod
+    def from_prior(
+        cls,
+        task: Task,
+        barriers: Sequence[Barrier],
+        lower: Float[Tensor, "B p"],
+        upper: Float[Tensor, "B p"],
+        **settings: Any,
+    ) -> ParameterUkf:
+        """Start from a prior box: its centre, and the standard deviation of a uniform distribution, width/sqrt(12)."""
+        lower, upper = lower.to(torch.float64), upper.to(torch.float64)
+        return cls(task, barriers, (lower + upper) / 2, (upper - lower) / math.sqrt(12), **settings)
+
+    def update(self, measurement: Measurement) -> UkfEstimate:
+        """Take in one measurement of all robots.
+
+        Raises:
+            InputError: the measurement has no velocities or another batch, or its time does not increase.
+        """
+        t, robots = measurement.t, len(self.mean)
+        if measurement.u is None or measurement.x.ndim != 2 or len(measurement.x) != robots:
+            raise InputError("measurement", f"positions and velocities ({robots}, n)", tuple(measurement.x.shape))
+        if not (math.isfinite(t) and t > self._t):
+            raise InputError("measurement.t", f"a time after {self._t}", t)
+        with torch.no_grad():
+            motions = self._read_motions(measurement)
+        seen = (measurement.x.abs() < FARTHEST).all(-1)
+        if measurement.observed is not None:
+            seen = seen & measurement.observed
+        dt = t - self._t if math.isfinite(self._t) else 0.0
+
+        x = measurement.x.detach().to(torch.float64).numpy()
+        status = [self._update_robot(i, dt, x[i] if seen[i] else None) for i in range(robots)]
+        self._t, self._motions = t, motions
+        self.filters = [kalman if motion else None for kalman, motion in zip(self.filters, motions, strict=True)]
+        return UkfEstimate(
+            t,
+            torch.from_numpy(self._theta.copy()),
+            torch.from_numpy(self._covariance.copy()),
+            torch.tensor(status, dtype=torch.long),
+        )
+
+    def correct(self, theta: Float[Tensor, "B p"]) -> None:
+        """Replace the means of theta, keep the covariances.
+
+        The position moves along as it is correlated with theta: the state becomes the one nearest to what it was, in
+        the metric of the whole covariance, that has this theta.
+
+        Raises:
+            InputError: `theta` is not finite or not (B, p).
+        """
+        if theta.shape != self.mean.shape or not bool(theta.isfinite().all()):
+            raise InputError("theta", f"finite parameters {tuple(self.mean.shape)}", theta)
+        corrected = theta.detach().to(torch.float64).numpy().copy()
+        for i, kalman in enumerate(self.filters):
+            if kalman is not None:
+                n = len(kalman.x) - theta.shape[-1]
+                change = np.linalg.solve(kalman.P[n:, n:], corrected[i] - kalman.x[n:])
+                kalman.x = np.concatenate([kalman.x[:n] + kalman.P[:n, n:] @ change, corrected[i]])
+        self._theta = corrected
+
+    def _read_motions(self, measurement: Measurement) -> list[Motion | None]:
+        """How each robot moves from this measurement on, as a function of theta; None where that cannot be read."""
+        assert measurement.u is not None
+        rows = stack_barriers(self.barriers, measurement)
+        C, d = self.task(measurement)
+        finite = [rows.A.flatten(1), rows.b, C.flatten(1), d, measurement.u]
+        known = torch.stack([values.isfinite().all(-1) for values in finite]).all(0)
+        if measurement.observed is not None:
+            known = known & measurement.observed
+        safe_controls = rows.where(known.unsqueeze(-1))
+        C = torch.where(known[:, None, None], C, 0.0).to(torch.float64)
+        d = torch.where(known[:, None], d, 0.0).to(torch.float64)
+        u = torch.where(known[:, None], measurement.u, 0.0).to(torch.float64)
+        slack = safe_controls.slack(u)
+        failed = controller_failed(self.barriers, measurement, safe_controls)
+        known = (known & ~failed & (slack >= -self.active_tolerance).all(-1)).tolist()
+        clip = self.task.saturation
+        if self.qp_inside:
+            items = zip(safe_controls.A, safe_controls.b, C, d, strict=True)
+            moving = [_QpMotion(_Wish(C_i, d_i, clip), Halfspaces(A, b)) for A, b, C_i, d_i in items]
+        else:
+            kkt = solve_kkt(safe_controls, active_set(safe_controls, u, self.active_tolerance), C, d)
+            items = zip(kkt.free, kkt.offset, C, d, strict=True)
+            moving = [_ObservedMotion(_Wish(C_i, d_i, clip), free, offset) for free, offset, C_i, d_i in items]
+        return [motion if readable else None for motion, readable in zip(moving, known, strict=True)]
+
+    def _update_robot(self, i: int, dt: float, position: Array | None) -> FilterStatus:
+        """Bring robot i's filter, mean and covariance to the time of the measurement."""
+        kalman, motion = self.filters[i], self._motions[i]
+        drift = np.maximum(self.process_noise**2 * dt, (FLOOR * self._scale[i]) ** 2)
+        if kalman is not None and motion is not None and position is not None:
+            n = len(position)
+            walk = max(self.motion_noise**2 * dt, (FLOOR * self.position_noise) ** 2)
+            kalman.Q = np.diag(np.concatenate([np.full(n, walk), drift]))
+            scale = np.concatenate([np.full(n, self.position_noise), self._scale[i]])
+            try:
+                repaired = _advance(kalman, dt, motion, position, scale)
+            except SolverError:
+                pass  # the QP at some sigma point: the motion is not known after all
+            else:
+                self._theta[i], self._covariance[i] = kalman.x[n:], kalman.P[n:, n:]
+                return FilterStatus.REPAIRED if repaired else FilterStatus.OK
+        if dt > 0:
+            self._covariance[i] += np.diag(drift)
+        self.filters[i] = None if position is None else self._start(i, position)
+        return FilterStatus.PREDICTED
+
+    def _start(self, i: int, position: Array) -> UnscentedKalmanFilter:
+        """A filter at a first position, which is all that is known about x, and with what is known about theta."""
+        n, p = len(position), self._theta.shape[-1]
+        points = MerweScaledSigmaPoints(n + p, **SIGMA_POINTS)
+        kalman = _Filter(n + p, n, dt=math.nan, hx=_position, fx=_move, points=points)
+        kalman.x = np.concatenate([position, self._theta[i]])
+        kalman.R = np.eye(n) * self.position_noise**2
+        kalman.P = np.zeros((n + p, n + p))
+        kalman.P[:n, :n], kalman.P[n:, n:] = kalman.R, self._covariance[i]
+        return kalman
+
+
+# What filterpy works with. Functions and records of this module, not closures, so that an observer can be pickled.
+
+
+class _Filter(UnscentedKalmanFilter):
+    """filterpy's filter, with `fx` called once for all sigma points: a batch of QPs instead of one after the other."""
+
+    def compute_process_sigmas(self, dt: float, fx: Callable[..., Array] | None = None, **fx_args: Any) -> None:
+        self.sigmas_f = (fx or self.fx)(self.points_fn.sigma_points(self.x, self.P), dt, **fx_args)
+
+
+@dataclass(frozen=True)
+class _Wish:
+    """uhat = C theta + d, clipped if the task says so."""
+
+    C: Float[Tensor, "n p"]
+    d: Float[Tensor, "n"]
+    clip: Saturation | None
+
+    def __call__(self, theta: Array) -> Float[Tensor, "s n"]:
+        wish = torch.from_numpy(theta) @ self.C.T + self.d
+        return wish if self.clip is None else self.clip(wish)
+
+
+@dataclass(frozen=True)
+class _ObservedMotion:
+    """u = (I - P) uhat + A_a^+ b_a, which is G theta + f where nothing is clipped."""
+
+    wish: _Wish
+    free: Float[Tensor, "n n"]
+    offset: Float[Tensor, "n"]
+
+    def __call__(self, theta: Array) -> Array:
+        return (self.wish(theta) @ self.free.T + self.offset).numpy()
+
+
+@dataclass(frozen=True)
+class _QpMotion:
+    """u = argmin |u - uhat|^2 over the safe controls; zero where there are none."""
+
+    wish: _Wish
+    safe_controls: Halfspaces
+
+    def __call__(self, theta: Array) -> Array:
+        return solve_safe_qp(self.safe_controls, self.wish(theta)).u.numpy()
+
+
+def _move(states: Array, dt: float, motion: Motion, n: int) -> Array:
+    return np.concatenate([states[:, :n] + dt * motion(states[:, n:]), states[:, n:]], axis=1)
+
+
+def _position(state: Array, n: int) -> Array:
+    return state[:n]
+
+
+def _advance(kalman: UnscentedKalmanFilter, dt: float, motion: Motion, position: Array, scale: Array) -> bool:
+    """Predict and update. The covariance is made definite before filterpy takes its square root; was it repaired?"""
+    n, repairs = len(position), []
+
+    def definite(covariance: Array) -> Array:
+        made, repaired = _make_definite(covariance, scale)
+        repairs.append(repaired)
+        return made
+
+    def transform(*arguments: Any) -> tuple[Array, Array]:
+        mean, covariance = unscented_transform(*arguments)
+        return mean, definite(covariance)
+
+    kalman.P = definite(kalman.P)
+    kalman.predict(dt, UT=transform, motion=motion, n=n)
+    kalman.update(position, n=n)
+    kalman.P = definite(kalman.P)
+    return any(repairs)
+
+
+def _make_definite(covariance: Array, scale: Array) -> tuple[Array, bool]:
+    """The symmetric part, and if that is not positive definite, with its eigenvalues (in units of `scale`) raised."""
+    symmetric = (covariance + covariance.T) / 2
+    try:
+        np.linalg.cholesky(symmetric)
+    except np.linalg.LinAlgError:
+        values, axes = np.linalg.eigh(symmetric / np.outer(scale, scale))
+        axes = axes * scale[:, None]
+        floor = max(DEFINITE * np.abs(values).max(), FLOOR**2)
+        raised = (axes * values.clip(min=floor)) @ axes.T
+        return (raised + raised.T) / 2, True
+    return symmetric, False

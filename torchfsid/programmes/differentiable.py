@@ -1,0 +1,330 @@
+r"""Two convex programmes over half-spaces {z : A z <= b}, exact and differentiable: nearest point and inscribed ball.
+
+    nearest_point     min 1/2 (z - y)' H (z - y)   s.t.  A z <= b                (the metric H, I by default)
+    inscribed_ball    max r                        s.t.  a_j.z + |a_j| r <= b_j  (the Chebyshev centre z)
+
+The active rows N are found without gradients (`exact`). They alone decide the answer, and its derivatives:
+
+    point:  H z + N' mu = H y,  N z = b        ball:  (a_j, |a_j|) w = b_j, p + 1 rows, a square system
+
+Derivatives of any order, forward and backward, are right as long as the active rows stay the same. At a switch, or
+between tied rows (several on one line, more than p through one point), they are those of one side. The matrix N N',
+whose condition is that of the rows squared, is never formed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from inspect import signature
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchfsid.errors import InputError
+from torchfsid.halfspaces import Halfspaces
+from torchfsid.outcome import ProgrammeStatus
+from torchfsid.programmes import active_rows, exact
+from torchfsid.programmes.active_rows import simplex_around
+from torchfsid.tolerances import PARALLEL_ROWS
+
+
+class NearestPoint(NamedTuple):
+    """The nearest point, in the type of the point given, and a `ProgrammeStatus`."""
+
+    point: Float[Tensor, "*batch p"]
+    status: Int[Tensor, "*batch"]
+
+
+class InscribedBall(NamedTuple):
+    """Centre and radius of the largest inscribed ball, and a `ProgrammeStatus`."""
+
+    centre: Float[Tensor, "*batch p"]
+    radius: Float[Tensor, "*batch"]
+    status: Int[Tensor, "*batch"]
+
+
+def nearest_point(
+    halfspaces: Halfspaces, point: Float[Tensor, "*#batch p"], metric: Float[Tensor, "*#batch p p"] | None = None
+) -> NearestPoint:
+    """The point of each set nearest to `point` in the norm sqrt(z' metric z) (default: Euclidean). Batches broadcast.
+
+    Raises:
+        InputError: dimensions or batches do not fit.
+    """
+    found, _, _, _, status = nearest(*broadcast(halfspaces, point, metric))
+    return NearestPoint(found.to(point.dtype), status)
+
+
+def nearest(
+    halfspaces: Halfspaces, y: Tensor, metric: Tensor | None = None, parallel: float = PARALLEL_ROWS
+) -> tuple[Tensor, ...]:
+    """The point, the multipliers mu, the active rows, which of their places are filled, and the status, for `broadcast`
+    arguments. The two first have gradients. Rows less than `parallel` [rad] apart may count as parallel."""
+    return _NearestPoint.apply(halfspaces.A, halfspaces.b, y, metric, parallel)  # type: ignore[return-value]
+
+
+def inscribed_ball(halfspaces: Halfspaces) -> InscribedBall:
+    """A largest ball inside each set; inside an empty set its radius is negative.
+
+    Where the centre is not unique, the one with the smallest z_1 is returned, among these the one with the smallest
+    z_2, and so on: its gradient is that of the rows that decide it so. The radius and its gradient are right anyway.
+    """
+    halfspaces, *_ = broadcast(halfspaces)
+    centre, radius, _, status = _InscribedBall.apply(halfspaces.A, halfspaces.b)  # type: ignore[misc]
+    return InscribedBall(centre, radius, status)
+
+
+def broadcast(
+    halfspaces: Halfspaces, point: Tensor | None = None, metric: Tensor | None = None
+) -> tuple[Halfspaces, Any, Any]:
+    """Half-spaces with at least one row, point and metric in float64, with one batch shape."""
+    p = halfspaces.dim
+    if halfspaces.rows == 0:
+        A, b = halfspaces.A, halfspaces.b
+        halfspaces = Halfspaces(A.new_zeros(*A.shape[:-2], 1, p), b.new_ones(*b.shape[:-1], 1))
+    if point is None:
+        return halfspaces, None, None
+    if point.shape[-1:] != (p,):
+        raise InputError("point", f"(*batch, {p})", tuple(point.shape))
+    if metric is not None and metric.shape[-2:] != (p, p):
+        raise InputError("metric", f"(*batch, {p}, {p})", tuple(metric.shape))
+    shapes = [halfspaces.batch_shape, point.shape[:-1]] + ([] if metric is None else [metric.shape[:-2]])
+    if any(shape != shapes[0] for shape in shapes):
+        try:
+            batch = torch.broadcast_shapes(*shapes)
+        except RuntimeError as error:
+            raise InputError("halfspaces, point, metric", "batches that broadcast", [*map(tuple, shapes)]) from error
+        A, b = halfspaces.A.expand(*batch, halfspaces.rows, p), halfspaces.b.expand(*batch, halfspaces.rows)
+        halfspaces, point = Halfspaces(A, b), point.expand(*batch, p)
+        metric = None if metric is None else metric.expand(*batch, p, p)
+    return halfspaces, point.to(torch.float64), None if metric is None else symmetric(metric.to(torch.float64))
+
+
+def symmetric(metric: Float[Tensor, "*batch p p"]) -> Float[Tensor, "*batch p p"]:
+    """The symmetric part, all of a metric that counts: so its gradient is symmetric, and a trained one stays it."""
+    return (metric + metric.mT) / 2
+
+
+def solve_active(
+    N: Tensor, filled: Tensor, pull: Tensor, offsets: Tensor, metric: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """z and mu with H z + N' mu = pull, N z = offsets, for the rows `filled` of N, its first ones; with gradients."""
+    return _SolveActive.apply(N, filled, pull, offsets, metric)  # type: ignore[return-value]
+
+
+# With gradients -----------------------------------------------------------------------------------------------------
+
+
+def _signed(forward: Callable) -> Callable:
+    """autograd asks for the signature of `forward` at every call, and finds it quicker this way."""
+    forward.__signature__ = signature(forward)  # type: ignore[attr-defined]
+    return forward
+
+
+class _NearestPoint(torch.autograd.Function):
+    """(A, b, y, H) -> the point, the multipliers mu, the active rows, the places they fill, the status."""
+
+    @staticmethod
+    @_signed
+    def forward(A: Tensor, b: Tensor, y: Tensor, metric: Tensor | None, parallel: float) -> tuple[Tensor, ...]:
+        search = partial(exact.nearest_point, parallel=parallel)
+        return on_arrays(search, *((A, b, y) if metric is None else (A, b, y, metric)))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
+        A, _, y, metric, _ = inputs
+        ctx.mark_non_differentiable(*output[2:])
+        ctx.save_for_backward(A, y, metric, *output)
+        ctx.save_for_forward(A, y, metric, *output)
+
+    @staticmethod
+    def backward(ctx: Any, of_z: Tensor, of_mu: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+        A, y, metric, z, mu, rows, filled, status = ctx.saved_tensors
+        if metric is None and _first_derivatives_suffice():
+            saved = A, rows, filled, mu, z, status
+            return *on_arrays(exact.of_nearest_point, *saved, of_z, of_mu), None, None
+        ok = status.unsqueeze(-1) == ProgrammeStatus.OK
+        z, metric = torch.where(ok, z, 0.0), _definite(metric, ok)
+        N, index = _taken(A, rows)
+        u, v = _SolveActive.apply(N, filled, torch.where(ok, of_z, 0.0), of_mu, metric)  # type: ignore[misc]
+        of_A = torch.zeros_like(A).scatter_add(-2, index, _of_rows(mu, u, v, z))
+        of_b = torch.zeros_like(A[..., 0]).scatter_add(-1, rows, v)
+        if metric is None:
+            return of_A, of_b, u, None, None
+        return of_A, of_b, times(metric, u), u.unsqueeze(-1) * torch.where(ok, y - z, 0.0).unsqueeze(-2), None
+
+    @staticmethod
+    def jvp(ctx: Any, dA: Any, db: Any, dy: Any, dmetric: Any, _: None) -> tuple[Tensor | None, ...]:
+        A, y, metric, z, mu, rows, filled, status = ctx.saved_tensors
+        ok = status.unsqueeze(-1) == ProgrammeStatus.OK
+        z, metric = torch.where(ok, z, 0.0), _definite(metric, ok)
+        N, index = _taken(A, rows)
+        pull, offsets = torch.zeros_like(z), torch.zeros_like(z)
+        if dA is not None:
+            dN = dA.gather(-2, index)
+            pull, offsets = pull - times(dN.mT, mu), offsets - times(dN, z)
+        if db is not None:
+            offsets = offsets + db.gather(-1, rows)
+        if dy is not None:
+            pull = pull + (dy if metric is None else times(metric, dy))
+        if dmetric is not None:
+            pull = pull + times(dmetric, y - z)
+        step, of_mu = _SolveActive.apply(N, filled, torch.where(ok, pull, 0.0), offsets, metric)  # type: ignore[misc]
+        return step, of_mu, None, None, None
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *inputs: Tensor | float | None) -> tuple:
+        return _NearestPoint.apply(*in_front(info.batch_size, in_dims, inputs)), (0,) * 5
+
+
+class _SolveActive(torch.autograd.Function):
+    """(N, filled, pull, offsets, H) -> z and mu with H z + N' mu = pull, N z = offsets, for the rows `filled` of N.
+
+    The system's matrix is symmetric: the derivative of a solution is another solution for the same rows.
+    """
+
+    @staticmethod
+    @_signed
+    def forward(
+        N: Tensor, filled: Tensor, pull: Tensor, offsets: Tensor, metric: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        tensors = (N, filled, pull, offsets) if metric is None else (N, filled, pull, offsets, metric)
+        z, mu = on_arrays(exact.solve_active, *tensors)
+        return z, mu
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, Tensor]) -> None:
+        N, filled, _, _, metric = inputs
+        ctx.save_for_backward(N, filled, metric, *output)
+        ctx.save_for_forward(N, filled, metric, *output)
+
+    @staticmethod
+    def backward(ctx: Any, of_z: Tensor, of_mu: Tensor) -> tuple[Tensor | None, ...]:
+        N, filled, metric, z, mu = ctx.saved_tensors
+        u, v = _SolveActive.apply(N, filled, of_z, of_mu, metric)  # type: ignore[misc]
+        return _of_rows(mu, u, v, z), None, u, v, None if metric is None else -u.unsqueeze(-1) * z.unsqueeze(-2)
+
+    @staticmethod
+    def jvp(ctx: Any, dN: Any, _: None, dpull: Any, doffsets: Any, dmetric: Any) -> tuple[Tensor, Tensor]:
+        N, filled, metric, z, mu = ctx.saved_tensors
+        dpull = torch.zeros_like(z) if dpull is None else dpull
+        doffsets = torch.zeros_like(mu) if doffsets is None else doffsets
+        if dN is not None:
+            dpull, doffsets = dpull - times(dN.mT, mu), doffsets - times(dN, z)
+        if dmetric is not None:
+            dpull = dpull - times(dmetric, z)
+        return _SolveActive.apply(N, filled, dpull, doffsets, metric)  # type: ignore[return-value]
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *tensors: Tensor | None) -> tuple:
+        return _SolveActive.apply(*in_front(info.batch_size, in_dims, tensors)), (0, 0)
+
+
+class _InscribedBall(torch.autograd.Function):
+    """(A, b) -> the centre, the radius, the rows that decide them, the status."""
+
+    @staticmethod
+    @_signed
+    def forward(A: Tensor, b: Tensor) -> tuple[Tensor, ...]:
+        return on_arrays(exact.inscribed_ball, A, b)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
+        ctx.mark_non_differentiable(*output[2:])
+        ctx.save_for_backward(inputs[0], *output[:3])
+        ctx.save_for_forward(inputs[0], *output[:3])
+
+    @staticmethod
+    def _system(A: Tensor, centre: Tensor, radius: Tensor, rows: Tensor) -> tuple[Tensor, ...]:
+        """The rows (a, |a|), where the ball touches them, which are real ones, and their index."""
+        real, rows = rows < A.shape[-2], rows.clamp(max=A.shape[-2] - 1)
+        N, index = _taken(A, rows)
+        N = torch.where(real.unsqueeze(-1), N, torch.as_tensor(simplex_around(A.shape[-1]), device=A.device))
+        norms = torch.linalg.vector_norm(N, dim=-1, keepdim=True)
+        touching = _finite(centre).unsqueeze(-2) + _finite(radius)[..., None, None] * N / norms
+        return torch.cat([N, norms], dim=-1), touching, real, rows, index
+
+    @staticmethod
+    def backward(ctx: Any, of_centre: Tensor, of_radius: Tensor, *_: Tensor) -> tuple[Tensor, Tensor]:
+        A, centre, radius, rows = ctx.saved_tensors
+        if _first_derivatives_suffice():
+            of_A, of_b = on_arrays(exact.of_inscribed_ball, A, centre, radius, rows, of_centre, of_radius)
+            return of_A, of_b
+        M, touching, real, rows, index = _InscribedBall._system(A, centre, radius, rows)
+        given = torch.cat([of_centre, of_radius.unsqueeze(-1)], dim=-1)
+        found = torch.cat([centre, radius.unsqueeze(-1)], dim=-1).isfinite()
+        # Not by linalg.solve: its forward derivative over a backward one is wrong under vmap (torch 2.13).
+        given, every = torch.where(found, given, 0.0), torch.ones_like(real)
+        _, v = _SolveActive.apply(M, every, given, torch.zeros_like(given), None)  # type: ignore[misc]
+        v = torch.where(real, v, 0.0)
+        of_A = torch.zeros_like(A).scatter_add(-2, index, -v.unsqueeze(-1) * touching)
+        return of_A, torch.zeros_like(A[..., 0]).scatter_add(-1, rows, v)
+
+    @staticmethod
+    def jvp(ctx: Any, dA: Any, db: Any) -> tuple[Tensor | None, ...]:
+        A, centre, radius, rows = ctx.saved_tensors
+        M, touching, real, rows, index = _InscribedBall._system(A, centre, radius, rows)
+        right = torch.zeros_like(M[..., 0]) if db is None else db.gather(-1, rows)
+        if dA is not None:
+            right = right - (dA.gather(-2, index) * touching).sum(-1)
+        right, every = torch.where(real, right, 0.0), torch.ones_like(real)
+        ball, _ = _SolveActive.apply(M, every, torch.zeros_like(right), right, None)  # type: ignore[misc]
+        found = centre.isfinite(), radius.isfinite()
+        return torch.where(found[0], ball[..., :-1], 0.0), torch.where(found[1], ball[..., -1], 0.0), None, None
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *tensors: Tensor | None) -> tuple:
+        return _InscribedBall.apply(*in_front(info.batch_size, in_dims, tensors)), (0,) * 4
+
+
+def _finite(values: Tensor) -> Tensor:
+    return torch.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def _first_derivatives_suffice() -> bool:
+    """Then they can be compiled: no graph of them is asked for, and no transform (vmap, jvp) looks through them."""
+    return active_rows.installed() and not torch.is_grad_enabled() and not torch._C._are_functorch_transforms_active()
+
+
+def _taken(A: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+    index = rows.unsqueeze(-1).expand(*rows.shape, A.shape[-1])
+    return A.gather(-2, index), index
+
+
+def _of_rows(mu: Tensor, u: Tensor, v: Tensor, z: Tensor) -> Tensor:
+    """The derivative with respect to the active rows, from a solution (z, mu) and its adjoint (u, v)."""
+    return -(mu.unsqueeze(-1) * u.unsqueeze(-2) + v.unsqueeze(-1) * z.unsqueeze(-2))
+
+
+def _definite(metric: Tensor | None, ok: Tensor) -> Tensor | None:
+    """The identity in place of a metric that is none."""
+    if metric is None:
+        return None
+    return torch.where(ok.unsqueeze(-1), metric, torch.eye(metric.shape[-1], dtype=metric.dtype, device=metric.device))
+
+
+def times(M: Tensor, v: Tensor) -> Tensor:
+    return (M @ v.unsqueeze(-1)).squeeze(-1)
+
+
+def on_arrays(of: Callable[..., tuple], A: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
+    """A function of numpy arrays with one batch dimension, on tensors with any number; A is a batch of matrices."""
+    batch, device = A.shape[:-2], A.device
+    arrays = (
+        t.detach().cpu().contiguous().numpy().reshape((batch.numel(), *t.shape[len(batch) :])) for t in (A, *others)
+    )
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        found = of(*arrays)
+    return tuple(torch.from_numpy(array.reshape((*batch, *array.shape[1:]))).to(device) for array in found)
+
+
+def in_front(size: int, dims: tuple, inputs: tuple) -> list[Tensor | float | None]:
+    """What a vmap is given, with its dimension in front of every tensor."""
+    return [
+        t if not isinstance(t, Tensor) else t.expand(size, *t.shape) if dim is None else t.movedim(dim, 0)
+        for t, dim in zip(inputs, dims, strict=True)
+    ]

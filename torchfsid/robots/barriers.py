@@ -1,0 +1,310 @@
+r"""What a robot must not do: rows A(x) u <= b(x) over its control, stacked from the barriers it uses.
+
+Avoidance of body j, with dx = x - x_j and h >= 0 the safe side (G., Eq. (6), in the units of control barrier
+functions):
+
+    squared    h = |dx|^2 - Ds^2     -2 dx.u        <= alpha(h)  [- 2 dx.u_j]
+    euclidean  h = |dx| - Ds         -(dx/|dx|).u   <= alpha(h)  [- (dx/|dx|).u_j]
+
+The bracket is the neighbour's share: nothing (`none`, the paper), its velocity now (`current`: one joint QP over the
+team) or one sample ago (`previous`). The paper's row, a = -dx, b = gamma/2 h, is `squared` with alpha(h) = gamma h,
+halved: the same half-space, and nothing here depends on a row's scale.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchfsid.errors import InputError
+from torchfsid.halfspaces import Halfspaces, dot
+from torchfsid.robots.bounds import ErrorBounds, RowErrors
+from torchfsid.robots.measurement import Measurement
+
+
+@runtime_checkable
+class Barrier(Protocol):
+    """Rows over the control u. `soft` rows may be violated by their controller (a slack variable), so a violation
+    of theirs is no alarm."""
+
+    @property
+    def soft(self) -> bool: ...
+
+    def __call__(self, measurement: Measurement) -> Halfspaces: ...
+
+    def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
+        """How far the rows may be off if the measurement is, by at most the bounds."""
+        ...
+
+    def labels(self, bodies: Sequence[str]) -> list[str]:
+        """A name for each row, given the names of the bodies."""
+        ...
+
+
+def stack_barriers(barriers: Sequence[Barrier], measurement: Measurement) -> Halfspaces:
+    """The safe controls: every barrier's rows, one below the other."""
+    return Halfspaces.stack([barrier(measurement) for barrier in barriers])
+
+
+@dataclass(frozen=True)
+class ClassK:
+    """alpha(h) = gain sign(h) |h|^power, an extended class-K function."""
+
+    gain: float | Tensor
+    power: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (bool(torch.as_tensor(self.gain) > 0) and self.power > 0):
+            raise InputError("class_k", "gain > 0 and power > 0", (self.gain, self.power))
+
+    def __call__(self, h: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+        return self.gain * (h if self.power == 1 else h.sign() * h.abs() ** self.power)
+
+
+@dataclass(frozen=True)
+class CollisionAvoidance:
+    """One row per body: stay `safety_distance` [m] away (a tensor (m,): from each its own), or radius_i + radius_j +
+    `margin` [m].
+
+    Raises `InputError` unless exactly one of the two is given, and when `margin` meets a measurement without radii or
+    `neighbour_velocity` one without the velocities it needs.
+    """
+
+    class_k: ClassK
+    safety_distance: float | Tensor | None = None
+    margin: float | None = None
+    distance: Literal["squared", "euclidean"] = "squared"
+    neighbour_velocity: Literal["none", "current", "previous"] = "none"
+    soft: bool = False
+
+    def __post_init__(self) -> None:
+        if (self.safety_distance is None) == (self.margin is None):
+            raise InputError("safety_distance, margin", "exactly one of them", (self.safety_distance, self.margin))
+        if self.safety_distance is not None and not bool((torch.as_tensor(self.safety_distance) > 0).all()):
+            raise InputError("safety_distance", "a positive distance [m]", self.safety_distance)
+
+    def __call__(self, measurement: Measurement) -> Halfspaces:
+        present = measurement.present
+        away = measurement.x.unsqueeze(-2) - measurement.bodies
+        # Slots that hold no body get a harmless vector, so that norms and their gradients stay finite.
+        away = away if bool(present.all()) else torch.where(present.unsqueeze(-1), away, 1.0)
+        squared_distance = dot(away, away)
+        Ds = self._safety_distance(measurement)
+        if self.distance == "squared":
+            h, gradient = squared_distance - Ds**2, 2 * away
+        else:
+            distance = squared_distance.sqrt()
+            h, gradient = distance - Ds, away / distance.unsqueeze(-1)
+        b = self.class_k(h)
+        if self.neighbour_velocity != "none":
+            b = b - dot(gradient, self._neighbours(measurement))
+        return Halfspaces(-gradient, b).where(present)
+
+    def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
+        """With r = |dx| known up to e: the direction up to asin(e/r), the boundary's distance phi(r) =
+        alpha(h)/|dh/dx|, which grows with r, by at most phi(r) - phi(r - e), and u across the turned row by 2
+        sin(angle/2) |u
+        - u_j|.
+
+        Raises:
+            InputError: class_k.power < 1/2 with squared distances: phi would not be monotone.
+        """
+        if self.distance == "squared" and self.class_k.power < 0.5:
+            raise InputError("class_k.power", "at least 1/2 where positions have errors", self.class_k.power)
+        present = measurement.present
+        away = torch.where(present.unsqueeze(-1), measurement.x.unsqueeze(-2) - measurement.bodies, 1.0)
+        r = away.square().sum(-1).sqrt()
+        e = bounds.position.unsqueeze(-1) + bounds.body_position
+        angle = torch.where(e < r, (e / r).clamp(max=1.0).arcsin(), math.pi)
+        motion = torch.zeros_like(away) if measurement.u is None else measurement.u.unsqueeze(-2)
+        velocity_error = torch.zeros_like(r)
+        if self.neighbour_velocity != "none":
+            motion = motion - self._neighbours(measurement)
+            velocity_error = bounds.body_velocity
+        turned = 2 * (angle / 2).sin() * motion.norm(dim=-1)
+        moved = self._boundary(r, measurement) - self._boundary((r - e).clamp(min=1e-9), measurement)
+        slack = torch.where(e < r, moved, torch.inf) + turned + velocity_error
+        return RowErrors(torch.where(present, angle, 0.0), torch.where(present, slack, 0.0))
+
+    def labels(self, bodies: Sequence[str]) -> list[str]:
+        return [f"avoid {body}" for body in bodies]
+
+    def _boundary(self, r: Tensor, measurement: Measurement) -> Tensor:
+        """phi(r): how fast the robot may approach a standing body at distance r [m/s]."""
+        Ds = self._safety_distance(measurement)
+        if self.distance == "squared":
+            return self.class_k(r**2 - Ds**2) / (2 * r)
+        return self.class_k(r - Ds)
+
+    def _safety_distance(self, measurement: Measurement) -> Tensor | float:
+        if self.margin is None:
+            assert self.safety_distance is not None
+            return self.safety_distance
+        if measurement.radius is None or measurement.body_radii is None:
+            raise InputError("measurement.radius", "radii, since the barrier is given by a margin", None)
+        return measurement.radius.unsqueeze(-1) + measurement.body_radii + self.margin
+
+    def _neighbours(self, measurement: Measurement) -> Tensor:
+        current = self.neighbour_velocity == "current"
+        velocities = measurement.body_velocities if current else measurement.previous_body_velocities
+        if velocities is None:
+            raise InputError("measurement", f"the {self.neighbour_velocity} velocities of the bodies", None)
+        return velocities
+
+
+@dataclass(frozen=True)
+class SpeedBox:
+    """|u_i| <= limit_i on every axis [m/s]: 2n rows."""
+
+    limit: tuple[float, ...]
+    soft: bool = False
+
+    def __post_init__(self) -> None:
+        if not all(limit > 0 for limit in self.limit):
+            raise InputError("limit", "positive speeds [m/s]", self.limit)
+
+    def __call__(self, measurement: Measurement) -> Halfspaces:
+        x = measurement.x
+        identity = torch.eye(len(self.limit), dtype=torch.float64, device=x.device)
+        limits = torch.tensor(self.limit * 2, dtype=torch.float64, device=x.device)
+        return _constant(torch.cat([identity, -identity]), limits, measurement)
+
+    def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
+        return _exact(2 * len(self.limit), bounds)
+
+    def labels(self, bodies: Sequence[str]) -> list[str]:
+        return [f"speed {sign}{axis}" for sign in "+-" for axis in "xyz"[: len(self.limit)]]
+
+
+@dataclass(frozen=True)
+class SpeedPolygon:
+    """u inside a regular polygon of circumradius `limit` [m/s], its first side across the first axis: the usual
+    approximation of |u| <= limit by u_1 <= limit cos(pi/sides) and its rotations (Robotarium's, with 8 sides)."""
+
+    sides: int
+    limit: float
+    soft: bool = False
+
+    def __post_init__(self) -> None:
+        if self.sides < 3 or not self.limit > 0:
+            raise InputError("speed_polygon", "sides >= 3 and limit > 0", (self.sides, self.limit))
+
+    def __call__(self, measurement: Measurement) -> Halfspaces:
+        side = torch.arange(self.sides, dtype=torch.float64, device=measurement.x.device)
+        angles = side * (2 * math.pi / self.sides)
+        normals = torch.stack([angles.cos(), angles.sin()], dim=-1)
+        apothem = self.limit * math.cos(math.pi / self.sides)
+        return _constant(normals, torch.full_like(angles, apothem), measurement)
+
+    def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
+        return _exact(self.sides, bounds)
+
+    def labels(self, bodies: Sequence[str]) -> list[str]:
+        return [f"speed side {side}" for side in range(self.sides)]
+
+
+@dataclass(frozen=True)
+class Arena:
+    """Stay `margin` [m] inside the box [lower, upper] [m]: h is the distance to each wall, +-u_i <= alpha(h)."""
+
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+    class_k: ClassK
+    margin: float = 0.0
+    soft: bool = False
+
+    def __post_init__(self) -> None:
+        if len(self.lower) != len(self.upper) or not all(a < b for a, b in zip(self.lower, self.upper, strict=True)):
+            raise InputError("arena", "lower < upper on every axis [m]", (self.lower, self.upper))
+
+    def __call__(self, measurement: Measurement) -> Halfspaces:
+        h = self._distances(measurement.x)
+        identity = torch.eye(len(self.lower), dtype=torch.float64, device=h.device)
+        return Halfspaces(torch.cat([identity, -identity]).expand(*h.shape, len(self.lower)), self.class_k(h))
+
+    def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
+        h = self._distances(measurement.x)
+        return RowErrors(torch.zeros_like(h), self.class_k(h) - self.class_k(h - bounds.position.unsqueeze(-1)))
+
+    def labels(self, bodies: Sequence[str]) -> list[str]:
+        return [f"wall {sign}{axis}" for sign in "+-" for axis in "xyz"[: len(self.lower)]]
+
+    def _distances(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch 2*n"]:
+        lower, upper = (torch.tensor(side, dtype=torch.float64, device=x.device) for side in (self.lower, self.upper))
+        to_upper, to_lower = upper - self.margin - x, x - lower - self.margin
+        return torch.cat([to_upper, to_lower], dim=-1)
+
+
+@dataclass(frozen=True)
+class AffineBarrier:
+    """Any rows A u <= b: A (m, n) and b (m,), given as tensors or as functions of the measurement.
+
+    `row_errors` says how far they may be off where positions have errors; needed only there.
+    """
+
+    A: Tensor | Callable[[Measurement], Tensor]
+    b: Tensor | Callable[[Measurement], Tensor]
+    names: tuple[str, ...]
+    soft: bool = False
+    row_errors: Callable[[Measurement, ErrorBounds], RowErrors] | None = None
+
+    def __call__(self, measurement: Measurement) -> Halfspaces:
+        A = self.A(measurement) if callable(self.A) else self.A
+        b = self.b(measurement) if callable(self.b) else self.b
+        m, (*batch, n) = len(self.names), measurement.x.shape
+        if A.shape[-2:] != (m, n) or b.shape[-1:] != (m,):
+            expected = f"A (*batch, {m}, {n}) and b (*batch, {m})"
+            raise InputError("AffineBarrier(A, b)", expected, (tuple(A.shape), tuple(b.shape)))
+        return Halfspaces(A.to(torch.float64).expand(*batch, m, n), b.to(torch.float64).expand(*batch, m))
+
+    def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
+        if self.row_errors is not None:
+            return self.row_errors(measurement, bounds)
+        if any(bool((bound > 0).any()) for bound in bounds):
+            raise InputError("AffineBarrier.row_errors", "how far the rows may be off where bodies may be", None)
+        return _exact(len(self.names), bounds)
+
+    def labels(self, bodies: Sequence[str]) -> list[str]:
+        return list(self.names)
+
+
+def is_joint(barriers: Sequence[Barrier]) -> bool:
+    """Does one QP decide for the whole team, since some rows count the neighbours' current velocities?"""
+    return any(isinstance(b, CollisionAvoidance) and b.neighbour_velocity == "current" for b in barriers)
+
+
+def controller_failed(
+    barriers: Sequence[Barrier], measurement: Measurement, rows: Halfspaces
+) -> Bool[Tensor, "*batch"]:
+    """Has the controller of each robot found no solution? Then it commands exactly zero, which says nothing.
+
+    A robot's own QP has failed if zero violates one of its `rows`. A joint QP stops the whole team, whichever pair is
+    at odds, so it may have failed whenever nobody moves.
+    """
+    assert measurement.u is not None
+    stopped = (measurement.u == 0).all(-1)
+    if not bool(stopped.any()):
+        return stopped
+    failed = stopped & (rows.b < 0).any(-1)
+    if is_joint(barriers) and measurement.body_velocities is not None:
+        others_move = (measurement.present & (measurement.body_velocities != 0).any(-1)).any(-1)
+        failed = failed | (stopped & ~others_move)
+    return failed
+
+
+def _constant(A: Tensor, b: Tensor, measurement: Measurement) -> Halfspaces:
+    """The same rows for every robot of the batch."""
+    batch = measurement.x.shape[:-1]
+    return Halfspaces(A.expand(*batch, *A.shape), b.expand(*batch, *b.shape))
+
+
+def _exact(rows: int, bounds: ErrorBounds) -> RowErrors:
+    """Rows that no position moves."""
+    nothing = bounds.position.unsqueeze(-1).expand(*bounds.position.shape, rows) * 0.0
+    return RowErrors(nothing, nothing)

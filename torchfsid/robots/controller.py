@@ -1,0 +1,154 @@
+r"""What a robot does: the safety QP, and the control as a differentiable function of everything it depends on.
+
+    u* = argmin |u - uhat|^2  s.t.  A u <= b,      uhat = C theta + d                       (G., Eq. (5))
+    uhat - u* = 1/2 sum_j mu_j a_j,   mu_j >= 0,   mu_j (a_j.u* - b_j) = 0                  (G., Eqs. (7)-(10))
+
+It is the point of the safe controls nearest to uhat (`programmes`): exact, and differentiable in theta, positions,
+gains and distances wherever the active set does not switch; at a switch the derivative is that of one side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchfsid.errors import InputError
+from torchfsid.halfspaces import Halfspaces
+from torchfsid.outcome import ProgrammeStatus
+from torchfsid.programmes.differentiable import broadcast, nearest
+from torchfsid.robots.barriers import Barrier, is_joint
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.tasks import Task
+from torchfsid.tolerances import PARALLEL_ACTIVE_ROWS
+
+
+class QpSolution(NamedTuple):
+    """The solution of a batch of safety QPs.
+
+    Attributes:
+        u: the controls [m/s]; zero where infeasible.
+        active: rows with a positive multiplier; at most n of them, so one of two equal rows, two of three at a vertex.
+        multipliers: mu_j >= 0 with uhat - u = 1/2 sum_j mu_j a_j, for the rows a_j as they were given.
+        feasible: some control satisfies the rows.
+    """
+
+    u: Float[Tensor, "*batch n"]
+    active: Bool[Tensor, "*batch m"]
+    multipliers: Float[Tensor, "*batch m"]
+    feasible: Bool[Tensor, "*batch"]
+
+
+def solve_safe_qp(safe_controls: Halfspaces, uhat: Float[Tensor, "*batch n"]) -> QpSolution:
+    """The control closest to `uhat` among the safe ones, with gradients. Batches broadcast.
+
+    An item whose rows or nominal control are not finite (two bodies at one place, say) counts as infeasible.
+
+    Raises:
+        InputError: `uhat` has another dimension than the rows.
+    """
+    m, n = safe_controls.rows, safe_controls.dim
+    if uhat.shape[-1:] != (n,):
+        raise InputError("uhat", f"(*batch, {n})", tuple(uhat.shape))
+    rows, y, _ = broadcast(safe_controls, uhat)
+    nearest_control, mu, places, filled, status = nearest(rows, y, parallel=PARALLEL_ACTIVE_ROWS)
+    feasible = status == ProgrammeStatus.OK
+    u = torch.where(feasible.unsqueeze(-1), nearest_control, 0.0)
+    held = torch.where(filled, 2 * mu.clamp(min=0), 0.0)
+    multipliers = torch.zeros_like(rows.b).scatter_add(-1, places, held)[..., :m]
+    return QpSolution(u, multipliers > 0, multipliers, feasible)
+
+
+@dataclass(frozen=True)
+class Control:
+    """What the robots do, and why.
+
+    Attributes:
+        u: the control [m/s]; zero where infeasible.
+        nominal: uhat, what the task alone would do [m/s].
+        active: rows with a positive multiplier (see `QpSolution`).
+        feasible: some control satisfies the rows.
+    """
+
+    u: Float[Tensor, "*batch n"]
+    nominal: Float[Tensor, "*batch n"]
+    active: Bool[Tensor, "*batch m"]
+    feasible: Bool[Tensor, "*batch"]
+
+
+@dataclass(frozen=True)
+class CbfQpController:
+    """Do the task, as closely as the barriers allow: `controller(measurement, theta)`.
+
+    If a barrier counts the neighbours' current velocities and the measurement does not hold them, nobody has decided
+    yet: the batch is then a team whose robot i is the body in slot i, the other bodies stand still, and one QP decides
+    for all of them (one infeasible robot then stops the team).
+
+    Soft barriers are kept like the others: `soft` is what an observer may forgive.
+
+    Raises `InputError` if there is no barrier.
+    """
+
+    task: Task
+    barriers: Sequence[Barrier]
+
+    def __post_init__(self) -> None:
+        if len(self.barriers) == 0:
+            raise InputError("barriers", "at least one barrier", self.barriers)
+
+    def __call__(self, measurement: Measurement, theta: Float[Tensor, "*theta_batch p"]) -> Control:
+        """The controls for the parameters `theta`; its batch and the measurement's broadcast.
+
+        Raises:
+            InputError: `theta` does not fit the task, or is not finite.
+        """
+        C, d = self.task(measurement)
+        if theta.shape[-1:] != C.shape[-1:]:
+            raise InputError("theta", f"(*batch, {C.shape[-1]}): {self.task.parameter_names}", tuple(theta.shape))
+        if not bool(theta.isfinite().all()):
+            raise InputError("theta", "finite parameters", theta.detach())
+        try:
+            uhat = (C.to(torch.float64) @ theta.to(torch.float64).unsqueeze(-1)).squeeze(-1) + d
+            uhat = uhat if self.task.saturation is None else self.task.saturation(uhat)
+        except RuntimeError as error:
+            raise InputError("theta", f"a batch that fits {tuple(d.shape[:-1])}", tuple(theta.shape)) from error
+        if measurement.body_velocities is None and is_joint(self.barriers):
+            return self._team_control(measurement, uhat)
+        safe_controls = Halfspaces.stack([barrier(measurement) for barrier in self.barriers])
+        return _control(safe_controls, uhat)
+
+    def _team_control(self, measurement: Measurement, uhat: Tensor) -> Control:
+        """One QP over the stacked controls. Row a.u_i - a.u_j <= b of the pair (i, j) stands in it for i and for j."""
+        if uhat.ndim != 2 or uhat.shape != measurement.x.shape:
+            raise InputError("measurement, theta", "one team (robots, n), for a joint QP", tuple(uhat.shape))
+        if bool(measurement.present.diagonal().any()):
+            raise InputError("measurement", "robot i to be the body in slot i, for a joint QP", "another order")
+        robots, n = uhat.shape
+        still = replace(measurement, body_velocities=torch.zeros_like(measurement.bodies))
+        parts = [barrier(still) for barrier in self.barriers]
+        own = torch.eye(robots, dtype=torch.float64, device=uhat.device).unsqueeze(1)
+        blocks, pair_columns, column = [], [], 0
+        for barrier, part in zip(self.barriers, parts, strict=True):
+            share = own.expand(robots, part.rows, robots)
+            if is_joint([barrier]):
+                share = share - torch.eye(part.rows, robots, dtype=torch.float64, device=uhat.device)
+                pair_columns.append(slice(column, column + robots))
+            blocks.append((share.unsqueeze(-1) * part.A.unsqueeze(-2)).flatten(-2))
+            column += part.rows
+        rows = torch.cat(blocks, dim=1).flatten(0, 1)
+        joint = Halfspaces(rows, torch.cat([part.b for part in parts], dim=-1).flatten())
+        control = _control(joint, uhat.flatten())
+        active = control.active.reshape(robots, column).clone()
+        for columns in pair_columns:
+            of_pairs = active[:, columns]
+            active[:, columns] = of_pairs | of_pairs.T
+        return Control(control.u.reshape(robots, n), uhat, active, control.feasible.expand(robots))
+
+
+def _control(safe_controls: Halfspaces, uhat: Tensor) -> Control:
+    u, active, _, feasible = solve_safe_qp(safe_controls, uhat)
+    return Control(u, uhat.expand(u.shape), active, feasible)

@@ -1,0 +1,230 @@
+r"""What a robot wants: nominal controls that are affine in an unknown parameter (G., Sec. III, Assumption 3).
+
+    uhat(x; theta) = C(x) theta + d(x),      C (*batch, n, p),  d (*batch, n).
+
+Every task is a frozen record, called with a `Measurement`, that returns (C, d). The paper asks for such a library of
+task-to-function mappings; the robots of its experiments use `GoalTask`: C = kp I, d = -kp x, theta = x_d.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchfsid.errors import InputError
+from torchfsid.robots.bounds import ErrorBounds
+from torchfsid.robots.measurement import Measurement
+
+Affine = tuple[Float[Tensor, "*batch n p"], Float[Tensor, "*batch n"]]
+
+
+@dataclass(frozen=True)
+class Saturation:
+    """uhat = clip(C theta + d): by norm, |uhat| <= v, or by axis, |uhat_i| <= v_i; zero below `dead_speed`.
+
+    Attributes:
+        shape: `norm` or `box`.
+        limits: the v_i [m/s], for `norm` twice the same; infinite if there is a dead zone only.
+        dead_speed: [m/s]; for a goal, its gain times the radius of the dead zone.
+    """
+
+    shape: Literal["norm", "box"]
+    limits: tuple[float, float]
+    dead_speed: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (min(self.limits) > self.dead_speed >= 0):
+            raise InputError("saturation", "limits > dead_speed >= 0 [m/s]", (self.limits, self.dead_speed))
+        if self.shape == "norm" and self.limits[0] != self.limits[1]:
+            raise InputError("saturation.limits", "one limit, twice, for a norm", self.limits)
+
+    def __call__(self, y: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
+        speed = y.square().sum(-1, keepdim=True).clamp(min=1e-300).sqrt()
+        if self.shape == "norm":
+            limit = self.limits[0]
+            clipped = y if math.isinf(limit) else y * (limit / speed).clamp(max=1.0)
+        else:
+            limits = y.new_tensor(self.limits)
+            clipped = y.clamp(-limits, limits)
+        return torch.where(speed < self.dead_speed, 0.0, clipped)
+
+
+@runtime_checkable
+class Task(Protocol):
+    """uhat = C theta + d, clipped if there is a `saturation`. `parameter_names` names the p entries of theta."""
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]: ...
+
+    @property
+    def saturation(self) -> Saturation | None: ...
+
+    def __call__(self, measurement: Measurement) -> Affine: ...
+
+    def drift(self, bounds: ErrorBounds, largest: Float[Tensor, "*batch p"]) -> Float[Tensor, "*batch"]:
+        """How far C theta + d may be off if positions are, by at most the bounds [m/s]; |theta_i| <= largest_i."""
+        ...
+
+
+def _positive(name: str, value: float | Tensor) -> None:
+    if not bool(torch.as_tensor(value) > 0):
+        raise InputError(name, "a positive number", value)
+
+
+def _identity_like(x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n n"]:
+    return torch.eye(x.shape[-1], dtype=x.dtype, device=x.device).expand(*x.shape, x.shape[-1])
+
+
+@dataclass(frozen=True)
+class GoalTask:
+    """Go to a goal: uhat = gain (theta - x), theta the goal [m], gain [1/s] (G., Sec. III)."""
+
+    gain: float | Tensor
+    parameter_names: tuple[str, ...] = ("goal_x", "goal_y")
+    saturation: Saturation | None = None
+
+    def __post_init__(self) -> None:
+        _positive("gain", self.gain)
+
+    def __call__(self, measurement: Measurement) -> Affine:
+        return self.gain * _identity_like(measurement.x), -self.gain * measurement.x
+
+    def drift(self, bounds: ErrorBounds, largest: Tensor) -> Tensor:
+        return self.gain * bounds.position
+
+
+@dataclass(frozen=True)
+class UnknownGainGoalTask:
+    """Go to a goal with an unknown gain: uhat = k (x_d - x) is linear in theta = (k, k x_d), so C = [-x  I], d = 0."""
+
+    parameter_names: tuple[str, ...] = ("gain", "gain_goal_x", "gain_goal_y")
+    saturation: Saturation | None = None
+
+    def __call__(self, measurement: Measurement) -> Affine:
+        x = measurement.x
+        return torch.cat([-x.unsqueeze(-1), _identity_like(x)], dim=-1), torch.zeros_like(x)
+
+    def drift(self, bounds: ErrorBounds, largest: Tensor) -> Tensor:
+        return largest[..., 0] * bounds.position
+
+
+@dataclass(frozen=True)
+class VelocityTask:
+    """Keep a constant velocity theta [m/s]: uhat = theta."""
+
+    parameter_names: tuple[str, ...] = ("velocity_x", "velocity_y")
+    saturation: Saturation | None = None
+
+    def __call__(self, measurement: Measurement) -> Affine:
+        return _identity_like(measurement.x), torch.zeros_like(measurement.x)
+
+    def drift(self, bounds: ErrorBounds, largest: Tensor) -> Tensor:
+        return torch.zeros_like(bounds.position)
+
+
+@dataclass(frozen=True)
+class FormationTask:
+    """Keep an offset theta [m] to a leader, the body in slot `leader`: uhat = gain (x_leader + theta - x).
+
+    Where the leader is not present d is NaN: nobody knows what the robot wants then.
+    """
+
+    gain: float | Tensor
+    leader: int
+    parameter_names: tuple[str, ...] = ("offset_x", "offset_y")
+    saturation: Saturation | None = None
+
+    def __post_init__(self) -> None:
+        _positive("gain", self.gain)
+
+    def __call__(self, measurement: Measurement) -> Affine:
+        seen = measurement.present[..., self.leader, None]
+        to_leader = torch.where(seen, measurement.bodies[..., self.leader, :] - measurement.x, torch.nan)
+        return self.gain * _identity_like(measurement.x), self.gain * to_leader
+
+    def drift(self, bounds: ErrorBounds, largest: Tensor) -> Tensor:
+        return self.gain * (bounds.position + bounds.body_position[..., self.leader])
+
+
+@dataclass(frozen=True)
+class OrbitTask:
+    """Circle a centre theta [m] at a known angular rate [rad/s]: uhat = rate J (x - theta), J a turn by 90 deg."""
+
+    rate: float | Tensor
+    parameter_names: tuple[str, ...] = ("centre_x", "centre_y")
+    saturation: Saturation | None = None
+
+    def __call__(self, measurement: Measurement) -> Affine:
+        turn = self.rate * measurement.x.new_tensor([[0.0, -1.0], [1.0, 0.0]])
+        return -turn.expand(*measurement.x.shape, 2), measurement.x @ turn.T
+
+    def drift(self, bounds: ErrorBounds, largest: Tensor) -> Tensor:
+        return abs(self.rate) * bounds.position
+
+
+@dataclass(frozen=True)
+class PatrolTask:
+    """Follow a closed path r(t) = c + sum_k a_k cos(k w t) + b_k sin(k w t), w the `rate` [rad/s].
+
+    uhat = gain (r - x) + dr/dt is linear in theta = (c, a_1, b_1, ...) [m], p = 2 + 4 `harmonics`.
+    """
+
+    gain: float
+    rate: float
+    harmonics: int = 1
+    saturation: Saturation | None = None
+
+    def __post_init__(self) -> None:
+        _positive("gain", self.gain)
+        _positive("harmonics", self.harmonics)
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        waves = [f"{wave}{k}_{axis}" for k in range(1, self.harmonics + 1) for wave in ("cos", "sin") for axis in "xy"]
+        return ("centre_x", "centre_y", *waves)
+
+    def __call__(self, measurement: Measurement) -> Affine:
+        identity = _identity_like(measurement.x)
+        blocks = [self.gain * identity]
+        for k in range(1, self.harmonics + 1):
+            w = k * self.rate
+            cos, sin = math.cos(w * measurement.t), math.sin(w * measurement.t)
+            blocks += [(self.gain * cos - w * sin) * identity, (self.gain * sin + w * cos) * identity]
+        return torch.cat(blocks, dim=-1), -self.gain * measurement.x
+
+    def drift(self, bounds: ErrorBounds, largest: Tensor) -> Tensor:
+        return self.gain * bounds.position
+
+
+@dataclass(frozen=True)
+class AffineTask:
+    """Any task that is affine in theta: C (n, p) and d (n,), given as tensors or as functions of the measurement.
+
+    `sensitivity` bounds how fast C theta + d changes with any position [1/s]; needed only where positions have errors.
+    """
+
+    C: Tensor | Callable[[Measurement], Tensor]
+    d: Tensor | Callable[[Measurement], Tensor]
+    parameter_names: tuple[str, ...]
+    saturation: Saturation | None = None
+    sensitivity: float | None = None
+
+    def __call__(self, measurement: Measurement) -> Affine:
+        C = self.C(measurement) if callable(self.C) else self.C
+        d = self.d(measurement) if callable(self.d) else self.d
+        shape = measurement.x.shape
+        if C.shape[-2:] != (shape[-1], len(self.parameter_names)) or d.shape[-1:] != shape[-1:]:
+            expected = f"C (*batch, {shape[-1]}, {len(self.parameter_names)}) and d (*batch, {shape[-1]})"
+            raise InputError("AffineTask(C, d)", expected, (tuple(C.shape), tuple(d.shape)))
+        return C.to(torch.float64).expand(*shape[:-1], *C.shape[-2:]), d.to(torch.float64).expand(shape)
+
+    def drift(self, bounds: ErrorBounds, largest: Tensor) -> Tensor:
+        if self.sensitivity is None and bool((bounds.position > 0).any() | (bounds.body_position > 0).any()):
+            raise InputError("AffineTask.sensitivity", "how fast C theta + d changes with positions [1/s]", None)
+        return (self.sensitivity or 0.0) * (bounds.position + bounds.body_position.amax(-1))

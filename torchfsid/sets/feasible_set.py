@@ -1,0 +1,290 @@
+r"""The feasible set Theta(t): where the parameter must lie, given everything seen so far (G., Eq. (3)).
+
+    Theta(t) = Theta_0  intersected with all  Omega(tau), tau <= t          Theta_0 a box, the prior
+
+A set is a value: `intersect` returns the next one. In the plane it is a batch of polygons, elsewhere a batch of
+polytopes; both are differentiable. Its promises: it contains the truth if all half-spaces do; its volume never grows;
+it stays bounded; the order of the half-spaces does not matter; it takes the memory of its facets, of which there are at
+most `max_facets`, merged outward. Each facet remembers when and from which constraint it came.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchfsid.errors import InputError
+from torchfsid.halfspaces import Halfspaces, finite
+from torchfsid.outcome import Outcome
+from torchfsid.programmes.differentiable import symmetric
+from torchfsid.sets.clipping import clip
+from torchfsid.sets.polygon import Polygon
+from torchfsid.sets.polytope import Polytope, clip_polytope, merge_polytope
+from torchfsid.tolerances import ROUND_OFF
+
+MAX_FACETS = 32
+"""Facets kept; more are merged outward. Costs below 1 % of the volume (tests/test_feasible_set.py)."""
+
+
+class Facets(NamedTuple):
+    """Rows of a set, with the time each came [s] (NaN: the prior) and the constraint (`source`; -1: the prior)."""
+
+    halfspaces: Halfspaces
+    time: Float[Tensor, "*batch f"]
+    source: Int[Tensor, "*batch f"]
+
+
+class Emptiness(NamedTuple):
+    """A three-way answer.
+
+    NONEMPTY comes with a `witness` inside (NaN otherwise), EMPTY with the rows that contradict (NaN otherwise);
+    UNDECIDED says that the half-spaces touch within round-off, and that the set kept is an outer one.
+    """
+
+    outcome: Int[Tensor, "*batch"]
+    witness: Float[Tensor, "*batch p"]
+    contradiction: Facets
+
+
+@dataclass(frozen=True)
+class FeasibleSet:
+    """A batch of bounded convex sets of parameters. Build it with `from_box`, shrink it with `intersect`.
+
+    Attributes:
+        body: the sets, batch flattened: a `Polygon` in the plane, a `Polytope` elsewhere.
+        batch_shape: the batch.
+        outcome: an `Outcome` per item; an EMPTY item contains nothing and stays empty, whatever its body.
+        contradiction: for EMPTY items the rows that no parameter satisfies together.
+        last_cut: the time of the intersection that last shrank the set [s]; NaN: never.
+        max_facets: facets kept.
+    """
+
+    body: Any
+    batch_shape: torch.Size
+    outcome: Int[Tensor, "*batch"]
+    contradiction: Facets
+    last_cut: Float[Tensor, "*batch"]
+    max_facets: int
+
+    @classmethod
+    def from_box(
+        cls, lower: Float[Tensor, "*batch p"], upper: Float[Tensor, "*batch p"], max_facets: int = MAX_FACETS
+    ) -> FeasibleSet:
+        """The prior Theta_0 = [lower, upper].
+
+        Raises:
+            InputError: shapes differ, or lower < upper fails somewhere, or `max_facets` cannot bound a set.
+        """
+        lower, upper = torch.as_tensor(lower).to(torch.float64), torch.as_tensor(upper).to(torch.float64)
+        if lower.shape != upper.shape or lower.ndim == 0:
+            raise InputError("lower, upper", "two tensors (*batch, p)", (tuple(lower.shape), tuple(upper.shape)))
+        if not bool((lower < upper).all()):
+            raise InputError("lower, upper", "lower < upper in every coordinate", (lower.tolist(), upper.tolist()))
+        batch, p = lower.shape[:-1], lower.shape[-1]
+        if max_facets < 2 * p:
+            raise InputError("max_facets", f"at least {2 * p}, the facets of the prior box", max_facets)
+        kind = Polygon if p == 2 else Polytope
+        nothing = lower.new_full((*batch, p + 1), float("nan"))
+        return cls(
+            body=kind.from_box(lower.reshape(-1, p), upper.reshape(-1, p)),
+            batch_shape=batch,
+            outcome=torch.full(batch, Outcome.NONEMPTY, device=lower.device),
+            contradiction=Facets(
+                Halfspaces(nothing.unsqueeze(-1).expand(*batch, p + 1, p), nothing),
+                nothing,
+                torch.full_like(nothing, -1).long(),
+            ),
+            last_cut=lower.new_full(batch, float("nan")),
+            max_facets=max_facets,
+        )
+
+    @property
+    def dim(self) -> int:
+        return self.body.A.shape[-1]
+
+    @property
+    def is_empty(self) -> Bool[Tensor, "*batch"]:
+        return self.outcome == Outcome.EMPTY
+
+    @cached_property
+    def any_empty(self) -> bool:
+        """Is any of the sets empty?"""
+        return bool(self.is_empty.any())
+
+    def intersect(
+        self,
+        halfspaces: Halfspaces,
+        time: float | Float[Tensor, "*batch"] = float("nan"),
+        compiled: bool | None = None,
+    ) -> FeasibleSet:
+        """The part of the set inside the half-spaces, whose facets are stamped with `time` [s] and the rows' `source`
+        (default: 0, 1, ...).
+
+        Rows that only touch the set within round-off are left out (an outer set). If merging facets would cost more
+        than the cut has gained, the set stays as it was. `compiled`: see `use_kernel`; in the plane only.
+
+        Raises:
+            InputError: dimension or batch do not fit, or a row is NaN or infinite, or `compiled` cannot be.
+        """
+        p, m = self.dim, halfspaces.rows
+        if halfspaces.dim != p or not _fits(halfspaces.batch_shape, self.batch_shape):
+            expected = f"rows over R^{p} for a batch {tuple(self.batch_shape)}"
+            raise InputError("halfspaces", expected, (tuple(halfspaces.A.shape), tuple(halfspaces.b.shape)))
+        if not finite(halfspaces.A, halfspaces.b):
+            raise InputError("halfspaces", "finite rows", "NaN or infinity")
+        if self.any_empty:
+            halfspaces = halfspaces.where(~self.is_empty.unsqueeze(-1))
+        source = torch.arange(m, device=self.outcome.device) if halfspaces.source is None else halfspaces.source
+        stamp = torch.as_tensor(time, dtype=torch.float64, device=self.outcome.device).expand(self.batch_shape)
+        rows = (
+            self._flat(halfspaces.A, (m, p)),
+            self._flat(halfspaces.b, (m,)),
+            self._flat(stamp, ()),
+            self._flat(source, (m,)),
+        )
+        if p == 2:
+            clipped: Any = clip(self.body, *rows, self.max_facets, compiled)
+            body, shrunk = clipped.body, clipped.shrunk
+        else:
+            clipped = clip_polytope(self.body, *rows)
+            body, shrunk = _merged(self.body, clipped.body, clipped.shrunk, self.max_facets)
+        if body is self.body and not bool(clipped.outcome.any()):
+            return self
+        shape, against = self.batch_shape, self.contradiction
+        outcome = torch.maximum(self.outcome, clipped.outcome.reshape(shape))
+        if bool((clipped.outcome == Outcome.EMPTY).any()):
+            found = clipped.contradiction
+            rows = Halfspaces(found.A.reshape(*shape, p + 1, p), found.b.reshape(*shape, p + 1))
+            fresh = Facets(rows, found.time.reshape((*shape, p + 1)), found.source.reshape((*shape, p + 1)))
+            against = _choose(self.is_empty, against, fresh)
+        last_cut = torch.where(shrunk.reshape(shape), stamp, self.last_cut)
+        return replace(self, body=body, outcome=outcome, contradiction=against, last_cut=last_cut)
+
+    def where(self, mask: Bool[Tensor, "*batch"], other: FeasibleSet) -> FeasibleSet:
+        """This set where `mask`, `other` elsewhere."""
+        items = (~mask).expand(self.batch_shape).reshape(-1).nonzero().squeeze(-1)
+        return replace(
+            self,
+            body=self.body.replaced(items, other.body.select(items)),
+            outcome=torch.where(mask, self.outcome, other.outcome),
+            contradiction=_choose(mask, self.contradiction, other.contradiction),
+            last_cut=torch.where(mask, self.last_cut, other.last_cut),
+        )
+
+    def select(self, items: Int[Tensor, "k"]) -> FeasibleSet:
+        """The sets at these places of a batch (B,); a place may be named more than once."""
+        against = self.contradiction
+        rows = Halfspaces(against.halfspaces.A[items], against.halfspaces.b[items])
+        return replace(
+            self,
+            body=self.body.select(items),
+            batch_shape=items.shape,
+            outcome=self.outcome[items],
+            contradiction=Facets(rows, against.time[items], against.source[items]),
+            last_cut=self.last_cut[items],
+        )
+
+    def emptiness(self) -> Emptiness:
+        """Is there a parameter left? With the proof, either way."""
+        sure = (self.outcome == Outcome.NONEMPTY).unsqueeze(-1)
+        return Emptiness(self.outcome, torch.where(sure, self.chebyshev()[0], float("nan")), self.contradiction)
+
+    def facets(self) -> Facets:
+        """The rows A theta <= b, none redundant beyond round-off, padded; with their time and source."""
+        shape, (A, b) = self.batch_shape, (self.body.A, self.body.b)
+        return Facets(
+            Halfspaces(A.reshape(*shape, *A.shape[1:]), b.reshape(*shape, b.shape[-1])),
+            self.body.time.reshape((*shape, b.shape[-1])),
+            self.body.source.reshape((*shape, b.shape[-1])),
+        )
+
+    def contains(self, theta: Float[Tensor, "*batch p"], tolerance: float = 1e-9) -> Bool[Tensor, "*batch"]:
+        """Is theta in the set, up to `tolerance` times its diameter (and round-off)?"""
+        margin = tolerance * self.diameter() + ROUND_OFF * theta.abs().amax(-1)
+        return (self.facets().halfspaces.slack(theta) >= -margin.unsqueeze(-1)).all(-1) & ~self.is_empty
+
+    def volume(self) -> Float[Tensor, "*batch"]:
+        """Area in the plane, length in one dimension, volume beyond; 0 for an empty set."""
+        return torch.where(self.is_empty, 0.0, self.body.volume().reshape(self.batch_shape))
+
+    def vertices(self) -> Float[Tensor, "*batch v p"]:
+        """Vertices (in the plane counter-clockwise), padded by repeating the first one."""
+        return self._batched(self.body.vertices)
+
+    def chebyshev(self) -> tuple[Float[Tensor, "*batch p"], Float[Tensor, "*batch"]]:
+        """Centre and radius of a largest inscribed ball. For elongated sets the centre jumps: see `centroid`."""
+        centre, radius = self.body.chebyshev()
+        return self._batched(centre), self._batched(radius)
+
+    def centroid(self) -> Float[Tensor, "*batch p"]:
+        """Centre of volume."""
+        return self._batched(self.body.centroid())
+
+    def diameter(self) -> Float[Tensor, "*batch"]:
+        """Largest distance between two points of the set."""
+        return self._batched(self.body.diameter())
+
+    def support(self, direction: Float[Tensor, "*batch p"]) -> Float[Tensor, "*batch"]:
+        """Support function h(n) = max n.theta over the set."""
+        flat = direction.to(torch.float64).expand(*self.batch_shape, self.dim).reshape(-1, 1, self.dim)
+        return self._batched(self.body.support(flat).squeeze(-1))
+
+    def project(
+        self, point: Float[Tensor, "*batch p"], metric: Float[Tensor, "*batch p p"] | None = None
+    ) -> Float[Tensor, "*batch p"]:
+        """The point of the set nearest to `point` in the norm sqrt(z' metric z) (default: Euclidean).
+
+        Raises:
+            InputError: `metric` is not (*batch, p, p).
+        """
+        p = self.dim
+        if metric is not None:
+            if metric.shape[-2:] != (p, p):
+                raise InputError("metric", f"(*batch, {p}, {p}), symmetric positive definite", tuple(metric.shape))
+            metric = symmetric(metric.to(torch.float64)).expand(*self.batch_shape, p, p).reshape(-1, p, p)
+        flat = point.to(torch.float64).expand(*self.batch_shape, p).reshape(-1, p)
+        return self._batched(self.body.nearest(flat, metric))
+
+    def _flat(self, rows: Tensor, shape: tuple[int, ...]) -> Tensor:
+        """One item of this shape for each set, the batch flattened."""
+        expanded = (*self.batch_shape, *shape)
+        rows = rows if rows.shape == expanded else rows.expand(expanded)
+        return rows if len(self.batch_shape) == 1 else rows.reshape(-1, *shape)
+
+    def _batched(self, flat: Tensor) -> Tensor:
+        return flat.reshape((*self.batch_shape, *flat.shape[1:]))
+
+
+def _fits(shape: torch.Size, batch: torch.Size) -> bool:
+    """Do rows of this batch shape broadcast to the sets' batch?"""
+    return len(shape) <= len(batch) and all(n in (1, N) for n, N in zip(reversed(shape), reversed(batch), strict=False))
+
+
+def _merged(
+    before: Polytope, body: Polytope, shrunk: Bool[Tensor, "B"], most: int
+) -> tuple[Polytope, Bool[Tensor, "B"]]:
+    """With at most `most` facets, or as before where merging would cost more than the cut has gained."""
+    over = (body.count > most).nonzero().squeeze(-1)
+    if len(over) == 0:
+        return body, shrunk
+    merged = merge_polytope(body.select(over), most)
+    grown = merged.volume() > before.select(over).volume()
+    body = body.replaced(over, merged).replaced(over[grown], before.select(over[grown]))
+    return body, shrunk.index_fill(0, over[grown], False)
+
+
+def _choose(mask: Bool[Tensor, "*batch"], mine: Facets, other: Facets) -> Facets:
+    rows = mask.unsqueeze(-1)
+    return Facets(
+        Halfspaces(
+            torch.where(rows.unsqueeze(-1), mine.halfspaces.A, other.halfspaces.A),
+            torch.where(rows, mine.halfspaces.b, other.halfspaces.b),
+        ),
+        torch.where(rows, mine.time, other.time),
+        torch.where(rows, mine.source, other.source),
+    )

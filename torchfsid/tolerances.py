@@ -1,0 +1,30 @@
+"""Every tolerance that more than one file needs, once, with its unit. No torch here, for the kernels."""
+
+from __future__ import annotations
+
+ROUND_OFF = 8 * 2.0**-52
+"""Relative error to allow for in a row's product with a point."""
+
+PARALLEL_ROWS = 1e-12
+"""Angle [rad] below which rows count as parallel."""
+
+TIE = 1e-12
+"""Multipliers that differ by less than this are equal: the ball is then free to roll, and the tie rule decides."""
+
+MOST_ROUNDS = 50
+"""Rounds per row and dimension after which a search gives up. A few rounds per dimension are usual."""
+
+PARALLEL_EDGES = 1e-14
+"""Sine of the angle below which two edges are not extended to their intersection."""
+
+RANK_TOLERANCE = 1e-7
+"""Relative singular value: unit rows less than twice this apart [rad] count as parallel. Below it round-off decides."""
+
+ANGLE_TOLERANCE = 1e-12
+"""Round-off allowed when an angular gap is compared with 180 degrees [rad]."""
+
+ACTIVE_TOLERANCE = 1e-3
+"""Default distance to a row's boundary below which the row counts as active [m/s]."""
+
+PARALLEL_ACTIVE_ROWS = 2 * RANK_TOLERANCE
+"""Angle [rad] below which rows count as parallel, so that active rows are apart for `solve_kkt` too."""
