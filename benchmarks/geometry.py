@@ -159,7 +159,7 @@ def run_batch(batch: int, updates: int, width: float | None, compiled: bool) -> 
     sets, truth, spent, cut = FeasibleSet.from_box(-corner, corner), torch.from_numpy(truths(batch, 0)), 0.0, 0
     for k, (A, b) in enumerate(workload(batch, updates, width)):
         halfspaces, began = Halfspaces(torch.from_numpy(A), torch.from_numpy(b)), time.process_time()
-        sets = sets.intersect(halfspaces, float(k), compiled=compiled)
+        sets = sets.intersect(halfspaces, float(k))
         sets.volume(), sets.vertices(), sets.chebyshev()
         spent += time.process_time() - began
         cut += int((sets.last_cut == k).sum())

@@ -117,3 +117,8 @@ def dot(v: Float[Tensor, "*#batch n"], w: Float[Tensor, "*#batch n"]) -> Float[T
 def finite(*tensors: Tensor) -> bool:
     """Are all numbers finite? Their sum is, unless it overflows."""
     return all(math.isfinite(float(t.detach().sum())) or bool(t.isfinite().all()) for t in tensors)
+
+
+def array(tensor: Tensor) -> np.ndarray:
+    """The tensor as the kernels take it: on the CPU, contiguous, without a copy if it is."""
+    return tensor.detach().cpu().contiguous().numpy()

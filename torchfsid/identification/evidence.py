@@ -15,13 +15,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchfsid.halfspaces import Halfspaces, finite
+from torchfsid.halfspaces import Halfspaces, array, finite
 from torchfsid.identification.active_set import active_set
 from torchfsid.identification.critical_region import FAN as CRITICAL_FAN
 from torchfsid.identification.critical_region import critical_region
 from torchfsid.identification.inverse_optimal import FAN, SPREAD, inverse_optimal_set, per_row
 from torchfsid.identification.kkt import KktSolution, solve_kkt
-from torchfsid.kernels.compiled import array, use_kernel
+from torchfsid.kernels.compiled import use_kernel
 from torchfsid.robots.bounds import NoiseBound, Uncertainty
 from torchfsid.robots.tasks import Saturation
 from torchfsid.tolerances import ANGLE_TOLERANCE, RANK_TOLERANCE, ROUND_OFF

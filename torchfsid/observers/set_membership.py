@@ -140,7 +140,7 @@ class SetMembershipObserver:
             InconsistentError: an intersection is empty, and `on_inconsistent` is `raise`.
         """
         reading, t = self.read(measurement), measurement.t
-        narrowed = self.feasible_set.intersect(reading.omega, t, self.compiled)
+        narrowed = self.feasible_set.intersect(reading.omega, t)
         informative = reading.informative
         if narrowed.any_empty or bool(reading.alarmed.any()):
             self._report(t, reading.alarmed, reading.slack, narrowed)

@@ -11,55 +11,22 @@ Where no gradient is needed, `polygon_kernel` does the same in compiled code.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchfsid.kernels.compiled import array, use_kernel
+from torchfsid.halfspaces import array
+from torchfsid.kernels.compiled import use_kernel
 from torchfsid.outcome import Outcome
-from torchfsid.sets.polygon import PRIOR, Polygon, cross, lengths, round_off, take
+from torchfsid.sets.body import Clipped, Contradiction
+from torchfsid.sets.polygon import Polygon, cross, lengths, round_off, take
 from torchfsid.sets.rings import Rings, chosen, columns
 from torchfsid.tolerances import PARALLEL_EDGES, ROUND_OFF
 
 CHUNK = 2048
 """Polygons that are cut at a time; an eighth of them where every row is looked at on every vertex."""
-
-
-@dataclass(frozen=True)
-class Contradiction:
-    """Three rows per item that no point satisfies together (Helly); NaN where there is none."""
-
-    A: Float[Tensor, "B 3 2"]
-    b: Float[Tensor, "B 3"]
-    time: Float[Tensor, "B 3"]
-    source: Int[Tensor, "B 3"]
-
-    @classmethod
-    def none(cls, batch: int, like: Tensor) -> Contradiction:
-        nothing = like.new_full((batch, 3), float("nan"))
-        return cls(
-            nothing.unsqueeze(-1).repeat(1, 1, 2), nothing, nothing.clone(), nothing.new_full((batch, 3), PRIOR).long()
-        )
-
-
-@dataclass(frozen=True)
-class Clipped:
-    """Polygons after a clip.
-
-    Attributes:
-        body: the intersection; where it is empty, the polygon as it was.
-        outcome: an `Outcome` per item.
-        shrunk: the item was really cut.
-        contradiction: for empty items, the rows that contradict each other.
-    """
-
-    body: Polygon
-    outcome: Int[Tensor, "B"]
-    shrunk: Bool[Tensor, "B"]
-    contradiction: Contradiction
 
 
 def clip(
@@ -83,7 +50,7 @@ def clip(
         return _clip_compiled(polygon, A, b, time, source, most)
     outcome = torch.full((len(A),), Outcome.NONEMPTY, device=A.device)
     shrunk = torch.zeros(len(A), dtype=torch.bool, device=A.device)
-    against, cuts, smaller = Contradiction.none(len(A), A), _Cuts.of(polygon, A, b), []
+    against, cuts, smaller = Contradiction.none(len(A), 2, A), _Cuts.of(polygon, A, b), []
     for some in cuts.chunks():
         part = polygon.select(some.item)
         table = _Table.of(part, *(field.index_select(0, some.item) for field in (A, b, time, source)))

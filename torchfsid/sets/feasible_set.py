@@ -22,9 +22,8 @@ from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, finite
 from torchfsid.outcome import Outcome
 from torchfsid.programmes.differentiable import symmetric
-from torchfsid.sets.clipping import clip
 from torchfsid.sets.polygon import Polygon
-from torchfsid.sets.polytope import Polytope, clip_polytope, merge_polytope
+from torchfsid.sets.polytope import Polytope
 from torchfsid.tolerances import ROUND_OFF
 
 MAX_FACETS = 32
@@ -120,16 +119,15 @@ class FeasibleSet:
         self,
         halfspaces: Halfspaces,
         time: float | Float[Tensor, "*batch"] = float("nan"),
-        compiled: bool | None = None,
     ) -> FeasibleSet:
         """The part of the set inside the half-spaces, whose facets are stamped with `time` [s] and the rows' `source`
         (default: 0, 1, ...).
 
         Rows that only touch the set within round-off are left out (an outer set). If merging facets would cost more
-        than the cut has gained, the set stays as it was. `compiled`: see `use_kernel`; in the plane only.
+        than the cut has gained, the set stays as it was.
 
         Raises:
-            InputError: dimension or batch do not fit, or a row is NaN or infinite, or `compiled` cannot be.
+            InputError: dimension or batch do not fit, or a row is NaN or infinite.
         """
         p, m = self.dim, halfspaces.rows
         if halfspaces.dim != p or not _fits(halfspaces.batch_shape, self.batch_shape):
@@ -147,12 +145,8 @@ class FeasibleSet:
             self._flat(stamp, ()),
             self._flat(source, (m,)),
         )
-        if p == 2:
-            clipped: Any = clip(self.body, *rows, self.max_facets, compiled)
-            body, shrunk = clipped.body, clipped.shrunk
-        else:
-            clipped = clip_polytope(self.body, *rows)
-            body, shrunk = _merged(self.body, clipped.body, clipped.shrunk, self.max_facets)
+        clipped = self.body.clip(*rows, self.max_facets)
+        body, shrunk = clipped.body, clipped.shrunk
         if body is self.body and not bool(clipped.outcome.any()):
             return self
         shape, against = self.batch_shape, self.contradiction
@@ -263,19 +257,6 @@ class FeasibleSet:
 def _fits(shape: torch.Size, batch: torch.Size) -> bool:
     """Do rows of this batch shape broadcast to the sets' batch?"""
     return len(shape) <= len(batch) and all(n in (1, N) for n, N in zip(reversed(shape), reversed(batch), strict=False))
-
-
-def _merged(
-    before: Polytope, body: Polytope, shrunk: Bool[Tensor, "B"], most: int
-) -> tuple[Polytope, Bool[Tensor, "B"]]:
-    """With at most `most` facets, or as before where merging would cost more than the cut has gained."""
-    over = (body.count > most).nonzero().squeeze(-1)
-    if len(over) == 0:
-        return body, shrunk
-    merged = merge_polytope(body.select(over), most)
-    grown = merged.volume() > before.select(over).volume()
-    body = body.replaced(over, merged).replaced(over[grown], before.select(over[grown]))
-    return body, shrunk.index_fill(0, over[grown], False)
 
 
 def _choose(mask: Bool[Tensor, "*batch"], mine: Facets, other: Facets) -> Facets:

@@ -19,11 +19,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchfsid.kernels.compiled import array, use_kernel
+from torchfsid.halfspaces import array
+from torchfsid.kernels.compiled import use_kernel
+from torchfsid.sets.body import PRIOR, Clipped
 from torchfsid.tolerances import ROUND_OFF
-
-PRIOR = -1
-"""`source` of the edges that a set began with."""
 
 
 @dataclass(frozen=True)
@@ -111,6 +110,18 @@ class Polygon:
                 for field, fill in zip(fields, (self.vertices[:, 0], *self.padding()), strict=True)
             )
         return Polygon(vertices, A, b, time, source, self.count, self.reach)
+
+    def clip(
+        self,
+        A: Float[Tensor, "B R 2"],
+        b: Float[Tensor, "B R"],
+        time: Float[Tensor, "B"],
+        source: Int[Tensor, "B R"],
+        most: int,
+    ) -> Clipped:
+        from torchfsid.sets.clipping import clip
+
+        return clip(self, A, b, time, source, most)
 
     # What is asked of a polygon ------------------------------------------------------------------------------------
 

@@ -9,7 +9,7 @@ leaves open stays in: every set is an outer set.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import nan
 from typing import Any, NamedTuple
@@ -22,9 +22,9 @@ from torch import Tensor
 
 from torchfsid.outcome import Outcome
 from torchfsid.sets import sensitivity
+from torchfsid.sets.body import PRIOR, Clipped, Contradiction
 from torchfsid.sets.cell import Cell, box, intersect, nearest, without_cheapest_facet
 from torchfsid.sets.faces import Indices
-from torchfsid.sets.polygon import PRIOR
 
 
 @dataclass(frozen=True)
@@ -120,6 +120,18 @@ class Polytope:
         required = any(tensor.requires_grad for tensor in (self.A, self.b, *others))
         return torch.is_grad_enabled() and required and len(self.A) > 0
 
+    def clip(
+        self,
+        A: Float[Tensor, "B R p"],
+        b: Float[Tensor, "B R"],
+        time: Float[Tensor, "B"],
+        source: Int[Tensor, "B R"],
+        most: int,
+    ) -> Clipped:
+        clipped = clip_polytope(self, A, b, time, source)
+        body, shrunk = _merged(self, clipped.body, clipped.shrunk, most)
+        return replace(clipped, body=body, shrunk=shrunk)
+
     # What is asked of a polytope ------------------------------------------------------------------------------------
 
     @property
@@ -204,40 +216,13 @@ class _Rows(NamedTuple):
         )
 
 
-@dataclass(frozen=True)
-class Contradiction:
-    """Up to p + 1 rows per item that no point satisfies together, NaN behind them: some y >= 0 has y'A = 0, y'b < 0."""
-
-    A: Float[Tensor, "B R p"]
-    b: Float[Tensor, "B R"]
-    time: Float[Tensor, "B R"]
-    source: Int[Tensor, "B R"]
-
-
-@dataclass(frozen=True)
-class ClippedPolytope:
-    """Polytopes after a clip.
-
-    Attributes:
-        body: the intersection; where it is empty, the polytope as it was.
-        outcome: an `Outcome` per item.
-        shrunk: the item was really cut.
-        contradiction: for empty items, the rows that contradict each other, without gradients.
-    """
-
-    body: Polytope
-    outcome: Int[Tensor, "B"]
-    shrunk: Bool[Tensor, "B"]
-    contradiction: Contradiction
-
-
 def clip_polytope(
     polytope: Polytope,
     A: Float[Tensor, "B R p"],
     b: Float[Tensor, "B R"],
     time: Float[Tensor, "B"],
     source: Int[Tensor, "B R"],
-) -> ClippedPolytope:
+) -> Clipped:
     """Intersect every polytope with its R half-spaces A z <= b, stamping new facets with `time` and `source`."""
     (B, R, p), F, device = A.shape, polytope.b.shape[1], polytope.A.device
     cells, outcome, shrunk = list(polytope._cells), np.full(B, int(Outcome.NONEMPTY)), np.zeros(B, dtype=bool)
@@ -253,7 +238,7 @@ def clip_polytope(
     rows = _Rows.join(polytope._rows(), (A, b, time.unsqueeze(-1).expand(B, R), source))
     body = Polytope._of(cells, origins, rows) if shrunk.any() else polytope
     contradiction = Contradiction(*(field.detach() for field in rows.at(conflict, nan, nan)))
-    return ClippedPolytope(body, outcomes, cut, contradiction)
+    return Clipped(body, outcomes, cut, contradiction)
 
 
 def merge_polytope(polytope: Polytope, most: int) -> Polytope:
@@ -267,6 +252,19 @@ def merge_polytope(polytope: Polytope, most: int) -> Polytope:
             cell, kept = larger
             cells[i], origins[i] = cell, origins[i][kept]
     return Polytope._of(cells, origins, _Rows.join(polytope._rows()))
+
+
+def _merged(
+    before: Polytope, body: Polytope, shrunk: Bool[Tensor, "B"], most: int
+) -> tuple[Polytope, Bool[Tensor, "B"]]:
+    """With at most `most` facets, or as before where merging would cost more than the cut has gained."""
+    over = (body.count > most).nonzero().squeeze(-1)
+    if len(over) == 0:
+        return body, shrunk
+    merged = merge_polytope(body.select(over), most)
+    grown = merged.volume() > before.select(over).volume()
+    body = body.replaced(over, merged).replaced(over[grown], before.select(over[grown]))
+    return body, shrunk.index_fill(0, over[grown], False)
 
 
 def _array(tensor: Tensor) -> NDArray:
