@@ -16,8 +16,9 @@ from torch import Tensor
 from torchfsid.errors import SolverError
 from torchfsid.outcome import Outcome
 from torchfsid.sets import clipping
+from torchfsid.sets.body import Clipped
 from torchfsid.sets.polygon import PRIOR, Polygon
-from torchfsid.sets.polytope import ClippedPolytope, Polytope, clip_polytope, merge_polytope
+from torchfsid.sets.polytope import Polytope, clip_polytope, merge_polytope
 
 BOX = 10.0
 """Half the side of the boxes that the sets begin with: the size their round-off is measured against."""
@@ -33,7 +34,7 @@ def box(p: int, half: float = BOX, count: int = 1) -> Polytope:
     return Polytope.from_box(tensor(np.full((count, p), -half)), tensor(np.full((count, p), half)))
 
 
-def cut(polytope: Polytope, A: np.ndarray, b: np.ndarray, time: float = 0.0) -> ClippedPolytope:
+def cut(polytope: Polytope, A: np.ndarray, b: np.ndarray, time: float = 0.0) -> Clipped:
     """Clip by rows (R, p), the same for every item, or (B, R, p)."""
     B = len(polytope.count)
     rows, right = tensor(A).expand(B, *A.shape[-2:]), tensor(b).expand(B, b.shape[-1])
