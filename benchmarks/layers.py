@@ -30,7 +30,7 @@ from torch import Tensor
 
 from benchmarks import save
 from torchfsid import ChebyshevCentre, Halfspaces, ProjectOnto
-from torchfsid.programmes import active_rows, conic
+from torchfsid.programmes import conic
 
 ROWS = (8, 24, 64)
 BATCHES = (1, 32, 256, 1024)
@@ -106,15 +106,6 @@ def ours(problem: str, backend: Any) -> Programme:
     return partial(chebyshev, ChebyshevCentre(backend))
 
 
-def interpreted(solver: Programme, A: Tensor, b: Tensor, y: Tensor) -> Tensor:
-    """The exact backend as it is where numba is not installed."""
-    there, active_rows.installed = active_rows.installed, lambda: False
-    try:
-        return solver(A, b, y)
-    finally:
-        active_rows.installed = there
-
-
 def solvers(problem: str) -> dict[str, Programme]:
     found: dict[str, Programme] = {
         "cvxpylayers DIFFCP, defaults": partial(plain, problem, "DIFFCP", ONE_THREAD),
@@ -123,9 +114,7 @@ def solvers(problem: str) -> dict[str, Programme]:
     if find_spec("moreau"):
         found["cvxpylayers MOREAU"] = partial(plain, problem, "MOREAU", {})
     found["torchfsid cvxpylayers"] = ours(problem, "cvxpylayers")
-    found["torchfsid exact, without numba"] = partial(interpreted, ours(problem, "exact"))
-    if active_rows.installed():
-        found["torchfsid exact"] = ours(problem, "exact")
+    found["torchfsid exact"] = ours(problem, "exact")
     return found
 
 
@@ -280,7 +269,7 @@ def main(arguments: list[str]) -> None:
         ]
         show(console, problem, block)
         results += block
-    packages = ["torch", "numpy", "cvxpy", "cvxpylayers", "diffcp", "scs"]
-    packages += [package for package in ("moreau", "numba") if find_spec(package)]
+    packages = ["torch", "numpy", "numba", "cvxpy", "cvxpylayers", "diffcp", "scs"]
+    packages += ["moreau"] if find_spec("moreau") else []
     where = save("layers", {"cores": os.cpu_count(), "measured": [asdict(r) for r in results]}, packages)
     print(f"saved: {where}")

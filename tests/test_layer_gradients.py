@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
-from tests.test_layers import BOTH_SEARCHES, random_sets, search, spd, tensor, triangle_ball  # noqa: F401
+from tests.test_layers import random_sets, spd, tensor, triangle_ball
 from torchfsid import ChebyshevCentre, Halfspaces, ProjectOnto
 from torchfsid.errors import InputError
 from torchfsid.outcome import ProgrammeStatus
@@ -43,9 +43,8 @@ def check(function: Callable[..., tuple[Tensor, ...]], *inputs: Tensor, fast: bo
     assert gradgradcheck(function, leaves, fast_mode=True)
 
 
-@BOTH_SEARCHES
 @pytest.mark.parametrize("p", [1, 2, 3, 5])
-def test_random_sets(search, p):  # noqa: F811
+def test_random_sets(p):
     check(answers, *bounded_sets(3, p + 3, p, seed=p), fast=p > 2)
 
 
@@ -118,8 +117,7 @@ def test_padding(rows_first):
     check(padded, A, b, y)
 
 
-@BOTH_SEARCHES
-def test_thin_sets(search):  # noqa: F811
+def test_thin_sets():
     """A triangle 1e-6 high, moved by shares of its height: a corner moves a million times as far as its rows."""
     height = 1e-6
     A, b, _ = triangle_ball(height)

@@ -14,16 +14,8 @@ from torch.func import grad, hessian, jacrev, vmap
 from torchfsid import ChebyshevCentre, Halfspaces, ProjectOnto
 from torchfsid.errors import InputError
 from torchfsid.outcome import ProgrammeStatus
-from torchfsid.programmes import active_rows
 
 
-@pytest.fixture
-def search(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch):
-    """The compiled search, or the one in numpy."""
-    monkeypatch.setattr(active_rows, "installed", lambda: request.param)
-
-
-BOTH_SEARCHES = pytest.mark.parametrize("search", [True, False], ids=["numba", "numpy"], indirect=True)
 BACKENDS = pytest.mark.parametrize("backend", ["exact", "cvxpylayers"])
 
 
@@ -47,10 +39,9 @@ def spd(p: int, seed: int = 0) -> Tensor:
 # Against other solvers ----------------------------------------------------------------------------------------------
 
 
-@BOTH_SEARCHES
 @pytest.mark.parametrize("p", [1, 2, 3, 5])
 @pytest.mark.parametrize("mahalanobis", [False, True])
-def test_projections_agree_with_daqp(search, p, mahalanobis):
+def test_projections_agree_with_daqp(p, mahalanobis):
     A, b, y = random_sets(60, 3 * p + 3, p, seed=p, least=-0.3)
     metric = spd(p) if mahalanobis else None
     point, status = ProjectOnto(metric)(Halfspaces(A, b), y)
@@ -68,9 +59,8 @@ def test_projections_agree_with_daqp(search, p, mahalanobis):
     assert (status == ProgrammeStatus.EMPTY).sum() > 5
 
 
-@BOTH_SEARCHES
 @pytest.mark.parametrize("p", [1, 2, 3, 5])
-def test_radius_and_depth_of_emptiness_agree_with_highs(search, p):
+def test_radius_and_depth_of_emptiness_agree_with_highs(p):
     A, b, _ = random_sets(60, 3 * p + 3, p, seed=p, least=-0.4)
     centre, radius, status = ChebyshevCentre()(Halfspaces(A, b))
     for i in range(len(A)):
@@ -93,9 +83,8 @@ def triangle_ball(height: float) -> tuple[Tensor, Tensor, float]:
     return tensor([0.0, -1.0], [height, 1.0], [-height, 1.0]), tensor(0.0, height, height), height / (1 + side)
 
 
-@BOTH_SEARCHES
 @pytest.mark.parametrize("height", [1.0, 1e-3, 1e-6, 1e-9])
-def test_thin_triangles_far_from_the_origin(search, height):
+def test_thin_triangles_far_from_the_origin(height):
     A, b, radius = triangle_ball(height)
     away = tensor(30.0, -20.0)
     ball = ChebyshevCentre()(Halfspaces(A, b + A @ away))
@@ -108,8 +97,7 @@ def test_thin_triangles_far_from_the_origin(search, height):
     torch.testing.assert_close(tip, away + tensor(0.0, height), atol=1e-13 / height, rtol=0)
 
 
-@BOTH_SEARCHES
-def test_of_many_centres_the_first_in_order_of_coordinates(search):
+def test_of_many_centres_the_first_in_order_of_coordinates():
     """A box, its rows in any order and at any scale: as far to the left, then as far down, as the ball fits."""
     rng = np.random.default_rng(0)
     for p, half in ((2, (3.0, 1.0)), (3, (2.0, 1.0, 3.0)), (3, (2.0, 2.0, 1.0))):

@@ -27,6 +27,9 @@ class ProgrammeStatus(IntEnum):
     """Of the inscribed ball: its radius is zero within round-off, the set has no interior."""
     UNDEFINED = 4
     """A row or the point is NaN or infinite, or the metric is not positive definite."""
+    UNSOLVED = 5
+    """No answer could be verified, not even one in rational arithmetic: numbers of very different sizes meet, or round-off
+    overflows. Ask in other units or nearer to the origin (shifted and scaled, the set's width being about 1)."""
 
 
 class FilterStatus(IntEnum):

@@ -8,8 +8,11 @@ ROUND_OFF = 8 * 2.0**-52
 PARALLEL_ROWS = 1e-12
 """Angle [rad] below which rows count as parallel."""
 
-TIE = 1e-12
-"""Multipliers that differ by less than this are equal: the ball is then free to roll, and the tie rule decides."""
+VERIFIED = 16 * ROUND_OFF
+"""Relative residual up to which the conditions of a solution hold: feasibility, stationarity, complementarity."""
+
+CLEARLY_EMPTY = 1e5
+"""Bounds that contradict each other by more than this times their round-off do so in whatever arithmetic."""
 
 MOST_ROUNDS = 50
 """Rounds per row and dimension after which a search gives up. A few rounds per dimension are usual."""
@@ -25,6 +28,3 @@ ANGLE_TOLERANCE = 1e-12
 
 ACTIVE_TOLERANCE = 1e-3
 """Default distance to a row's boundary below which the row counts as active [m/s]."""
-
-PARALLEL_ACTIVE_ROWS = 2 * RANK_TOLERANCE
-"""Angle [rad] below which rows count as parallel, so that active rows are apart for `solve_kkt` too."""

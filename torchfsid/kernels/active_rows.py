@@ -1,285 +1,316 @@
-r"""The searches of `active_rows`, where they are explained, in scalar code, item by item, compiled by numba.
+r"""Which rows of A z <= b are active at the solution of two convex programmes: the searches, for one item each.
 
-    Q, R        the active rows made orthonormal one by one, a_s = sum_i R_is Q_i; what a row has beyond them is free
-    inverse     by Gauss and Jordan with row exchanges
+    nearest point     min 1/2 |z|^2   s.t.  a_j.z <= b_j              at most p active rows
+    inscribed ball    max r           s.t.  a_j.z + r <= b_j          p + 1 active rows, w = (z, r)
 
-`active_rows` is the reference; tests compare the two. Every tolerance is an argument: numba's cache of compiled code
-does not see what changes in another file.
+The rows a_j are unit ones. Both are dual active-set methods: every iterate solves its own active rows exactly, and the
+row that it violates most enters, until none is violated.
+
+The nearest point is found after Goldfarb and Idnani (Math. Programming 27, 1983). The active rows are made orthogonal
+one by one, a_s = sum_i R_is Q_i with R_ss = 1. An entering row n is n = sum_s c_s a_s + d, d orthogonal to all of them.
+Pushing it by t changes the multipliers by -t c and its violation by -t |d|^2. A multiplier that reaches zero first
+leaves. If d = 0 and no multiplier can leave, then n - sum_s c_s a_s = 0 is a combination of rows with weights >= 0 whose
+bounds contradict each other: the set is empty.
+
+The inscribed ball is found by the dual simplex method with lexicographic ratios. They cannot cycle, and they make the
+answer unique: of all centres, the one with the smallest z_1, among these the one with the smallest z_2, and so on. It
+starts from a simplex around everything, infinitely far away: a number is then a finite part, and a rate at which it
+grows with the distance of the simplex.
+
+A pivot that round-off cannot tell from zero is never taken. `epsilon` is the round-off of the arithmetic: `ROUND_OFF`
+for floating point; 0 for exact rationals, for which the same functions are called without being compiled
+(`programmes.rational`). That is why there is no square root here, and why sums start from an integer.
 """
 
 from __future__ import annotations
 
-import math
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
 
-compiled = njit(cache=True, error_model="numpy", nogil=True)  # no_type_check: these must stay plain functions
+from torchfsid.kernels.compiled import item
+from torchfsid.outcome import ProgrammeStatus
+from torchfsid.tolerances import CLEARLY_EMPTY, MOST_ROUNDS, ROUND_OFF
+
+OK, EMPTY, UNSOLVED = int(ProgrammeStatus.OK), int(ProgrammeStatus.EMPTY), int(ProgrammeStatus.UNSOLVED)
 
 
-@compiled
+@item
 @no_type_check
-def _dot(v, w):
-    total = 0.0
+def dot(v, w):
+    total = 0
     for i in range(len(v)):
         total += v[i] * w[i]
     return total
 
 
-@compiled
+@item
 @no_type_check
-def _beyond(v, Q, k, share):
+def orthogonalise(v, Q, D, k, share):
     """Take from v what lies in the span of the first k rows of Q, twice, so that round-off is gone; share_i of Q_i."""
-    share[:k] = 0.0
+    for i in range(k):
+        share[i] = 0
     for _ in range(2):
         for i in range(k):
-            part = _dot(Q[i], v)
+            part = dot(Q[i], v) / D[i]
             share[i] += part
             for j in range(len(v)):
                 v[j] -= part * Q[i, j]
 
 
-@compiled
+@item
 @no_type_check
-def _back(R, right, k, x):
-    """R x = right, R upper triangular."""
+def solve_upper(R, right, k, x):
+    """R x = right for the unit upper triangular R, of which only what lies above the diagonal is read."""
     for i in range(k - 1, -1, -1):
         x[i] = right[i]
         for j in range(i + 1, k):
             x[i] -= R[i, j] * x[j]
-        x[i] /= R[i, i]
 
 
-@compiled
+@item
 @no_type_check
-def _orthonormal(A, rows, k, Q, R):
+def on_rows(b, Q, D, R, k, y, z):
+    """z = sum_i y_i Q_i with a_s.z = b_s for the k rows behind Q, R."""
+    for j in range(len(z)):
+        z[j] = 0
     for s in range(k):
-        for j in range(A.shape[1]):
-            Q[s, j] = A[rows[s], j]
-        _beyond(Q[s], Q, s, R[:, s])
-        R[s, s] = math.sqrt(_dot(Q[s], Q[s]))
-        for j in range(A.shape[1]):
-            Q[s, j] /= R[s, s]
+        y[s] = b[s]
+        for i in range(s):
+            y[s] -= R[i, s] * D[i] * y[i]
+        y[s] /= D[s]
+        for j in range(len(z)):
+            z[j] += y[s] * Q[s, j]
 
 
-@compiled
+@item
 @no_type_check
-def _most_violated(A, b, z, rise):
-    """The row with the largest a.z + rise - b; rows without a bound never."""
+def most_violated(A, b, z):
+    """The row with the largest a.z - b; rows without a bound never."""
     worst, row = -np.inf, -1
     for j in range(len(b)):
-        over = _dot(A[j], z) + rise - b[j]
+        over = dot(A[j], z) - b[j]
         if over > worst:
             worst, row = over, j
     return row, worst
 
 
-@compiled
+@item
 @no_type_check
-def nearest_rows(A, b, parallel, epsilon, most_rounds, point, rows, count, multipliers, empty):
-    """Into the last five; b infinite for rows to ignore."""
-    B, _, p = A.shape
-    Q, R = np.zeros((p, p)), np.zeros((p, p))
-    y, c, e, held, d, z = np.zeros(p), np.zeros(p), np.zeros(p), np.zeros(p), np.zeros(p), np.zeros(p)
-    for item in range(B):
-        own, k, q, push = rows[item], 0, -1, 0.0
-        empty[item] = True
-        for _ in range(most_rounds):
-            _orthonormal(A[item], own, k, Q, R)
-            z[:] = 0.0
-            for i in range(k):
-                y[i] = b[item, own[i]]
-                for j in range(i):
-                    y[i] -= R[j, i] * y[j]
-                y[i] /= R[i, i]
+def nearest_rows(A, b, sizes, epsilon, rows, Q, D, R, work, z):
+    """The point z nearest to the origin, and its active rows.
+
+    Args:
+        A: (m, p), unit rows.
+        b: (m,), infinite for rows to ignore.
+        sizes: (m,), the size of the numbers that each b was computed from: its round-off is ROUND_OFF times that.
+        epsilon: the round-off of the arithmetic.
+        rows: (p,), to be filled with the active rows.
+        Q, R: (p, p), scratch. D: (p,), scratch. work: (6, p), scratch.
+        z: (p,), to be filled with the point.
+
+    Returns:
+        How many rows are active, and OK, EMPTY or UNSOLVED.
+    """
+    m, p = A.shape
+    y, c, e, d, held, right = work[0], work[1], work[2], work[3], work[4], work[5]
+    k, q, push = 0, -1, 0
+    for _ in range(MOST_ROUNDS * (m + p)):
+        for s in range(k):
+            right[s] = b[rows[s]]
+        on_rows(right, Q, D, R, k, y, z)
+        fresh = q < 0
+        if fresh:
+            q, _ = most_violated(A, b, z)
+            push = 0
+            if q < 0:
+                return k, OK
+        # The entering row n = sum_s c_s a_s + d, pushed by `push` so far.
+        for j in range(p):
+            d[j] = A[q, j]
+        orthogonalise(d, Q, D, k, e)
+        solve_upper(R, e, k, c)
+        slope = dot(d, d)
+        for j in range(p):
+            z[j] -= push * d[j]
+        for s in range(k):
+            y[s] = -(y[s] + push * e[s])
+        solve_upper(R, y, k, held)
+        over = dot(A[q], z) - b[q]
+
+        size, coordinates, propagated = 0, 1, push * slope
+        for j in range(p):
+            size += abs(z[j])
+        for s in range(k):
+            coordinates += abs(c[s])
+            propagated += abs(c[s]) * (size + sizes[rows[s]])
+        noise = ROUND_OFF * (size + sizes[q]) + epsilon * propagated
+        if fresh and over <= noise:
+            return k, OK
+        apart = slope > (epsilon * coordinates) ** 2
+        full = max(over, 0) / slope if apart else np.inf
+        short, slot = np.inf, -1
+        for s in range(k):
+            if c[s] > epsilon * coordinates and max(held[s], 0) < short * c[s]:
+                short, slot = max(held[s], 0) / c[s], s
+        if short < full:
+            push += short
+            k -= 1
+            for s in range(slot, k):
+                rows[s] = rows[s + 1]
                 for j in range(p):
-                    z[j] += y[i] * Q[i, j]
-            fresh = q < 0
-            if fresh:
-                q, worst = _most_violated(A[item], b[item], z, 0.0)
-                if q < 0 or (k == 0 and worst <= 0.0):
-                    empty[item] = False
-                    break
-            n, bound = A[item, q], b[item, q]
+                    Q[s, j] = A[rows[s], j]
+                orthogonalise(Q[s], Q, D, s, R[:, s])
+                D[s] = dot(Q[s], Q[s])
+        elif apart:
+            rows[k], D[k] = q, slope
             for j in range(p):
-                d[j] = n[j]
-            _beyond(d, Q, k, e)
-            _back(R, e, k, c)
-            for j in range(p):
-                z[j] -= push * d[j]
-            for i in range(k):
-                y[i] = -(y[i] + push * e[i])
-            _back(R, y, k, held)
-            over, slope = _dot(n, z) - bound, _dot(d, d)
-
-            size, noise, coordinates = 0.0, 0.0, math.sqrt(slope)
-            for j in range(p):
-                size += abs(z[j])
-            for i in range(k):
-                noise += abs(c[i]) * (size + abs(b[item, own[i]]))
-                coordinates += abs(c[i])
-            noise += coordinates * push * slope + size + abs(bound)
-            if fresh and over <= epsilon * noise:
-                empty[item] = False
-                break
-            apart = slope > (parallel + epsilon * coordinates) ** 2
-            full = max(over, 0.0) / slope if apart else np.inf
-            short, slot = np.inf, -1
-            for i in range(k):
-                if c[i] > epsilon and max(held[i], 0.0) / c[i] < short:
-                    short, slot = max(held[i], 0.0) / c[i], i
-            if short < full:
-                k -= 1
-                own[slot] = own[k]
-                push += short
-            elif apart:
-                own[k] = q
-                k += 1
-                q, push = -1, 0.0
-            else:
-                break
-        if not empty[item]:
-            count[item] = k
-            for j in range(p):
-                point[item, j] = z[j]
-            for i in range(k):
-                multipliers[item, i] = max(held[i], 0.0)
-
-
-@compiled
-@no_type_check
-def solve_active(N, filled, pull, offsets, z, mu):
-    """`programmes.solve_active`, into the last two: z in the span of the rows from the offsets, beyond it from pull."""
-    B, p = offsets.shape
-    Q, R, y, e, d = np.zeros((p, p)), np.zeros((p, p)), np.zeros(p), np.zeros(p), np.zeros(p)
-    order = np.arange(p)
-    for item in range(B):
-        k = 0
-        while k < p and filled[item, k]:
+                Q[k, j] = d[j]
+            for s in range(k):
+                R[s, k] = e[s]
             k += 1
-        _orthonormal(N[item], order, k, Q, R)
-        for j in range(p):
-            d[j] = pull[item, j]
-        _beyond(d, Q, k, e)
-        for j in range(p):
-            z[item, j] = d[j]
-        for i in range(k):
-            y[i] = offsets[item, i]
-            for j in range(i):
-                y[i] -= R[j, i] * y[j]
-            y[i] /= R[i, i]
-            e[i] -= y[i]
-            for j in range(p):
-                z[item, j] += y[i] * Q[i, j]
-        _back(R, e, k, mu[item])
+            q = -1
+        elif over > noise and (epsilon == 0 or over > CLEARLY_EMPTY * noise):
+            return k, EMPTY
+        else:
+            break
+    return k, UNSOLVED
 
 
-@compiled
+@item
 @no_type_check
-def _invert(M, V):
-    """V = M^-1; M is lost."""
+def invert(M, V):
+    """V = M^-1 by Gauss and Jordan with row exchanges; M is lost. Is M regular?"""
     k = len(M)
-    V[:] = 0.0
     for i in range(k):
-        V[i, i] = 1.0
+        for j in range(k):
+            V[i, j] = 1 if i == j else 0
     for i in range(k):
         pivot = i
         for r in range(i + 1, k):
             if abs(M[r, i]) > abs(M[pivot, i]):
                 pivot = r
+        if M[pivot, i] == 0:
+            return False
         for j in range(k):
             M[i, j], M[pivot, j] = M[pivot, j], M[i, j]
             V[i, j], V[pivot, j] = V[pivot, j], V[i, j]
-        scale = 1.0 / M[i, i]
+        scale = 1 / M[i, i]
         for j in range(k):
             M[i, j] *= scale
             V[i, j] *= scale
         for r in range(k):
-            if r != i and M[r, i] != 0.0:
+            if r != i and M[r, i] != 0:
                 factor = M[r, i]
                 for j in range(k):
                     M[r, j] -= factor * M[i, j]
                     V[r, j] -= factor * V[i, j]
+    return True
 
 
-@compiled
+@item
 @no_type_check
-def inscribed_rows(A, b, simplex, tie, epsilon, most_rounds, ball, rows, open_centre, open_radius):
-    """Into the last four; b infinite for rows to ignore."""
-    B, m, p = A.shape
-    M, V = np.zeros((p + 1, p + 1)), np.zeros((p + 1, p + 1))
-    right, share, w, far = np.zeros(p + 1), np.zeros(p + 1), np.zeros(p + 1), np.zeros(p + 1)
-    able = np.zeros(p + 1, dtype=np.bool_)
-    for item in range(B):
-        basis = rows[item]
-        for s in range(p + 1):
-            basis[s] = m + s
-        for _ in range(most_rounds):
-            is_open = False
-            for s in range(p + 1):
-                row = A[item, basis[s]] if basis[s] < m else simplex[basis[s] - m]
-                right[s] = b[item, basis[s]] if basis[s] < m else 0.0
-                is_open |= basis[s] >= m
-                for j in range(p):
-                    M[s, j] = row[j]
-                M[s, p] = 1.0
-            _invert(M, V)
-            for i in range(p + 1):
-                w[i], far[i] = _dot(V[i], right), 0.0
-                for s in range(p + 1):
-                    if basis[s] >= m:
-                        far[i] += V[i, s]
-            q, worst, fastest = -1, -np.inf, tie
-            if is_open:  # infinitely violated rows come first, infinitely slack ones never
-                for j in range(m):
-                    if b[item, j] < np.inf:
-                        rate = _dot(A[item, j], far[:p]) + far[p]
-                        if rate > fastest:
-                            q, worst, fastest = j, np.inf, rate
-                        elif rate >= -tie and fastest == tie:
-                            over = _dot(A[item, j], w[:p]) + w[p] - b[item, j]
-                            if over > worst:
-                                q, worst = j, over
-            else:
-                q, worst = _most_violated(A[item], b[item], w[:p], w[p])
-            if q < 0:
-                break
-            n, bound = A[item, q], b[item, q]
-            size, noise = 0.0, 0.0
-            for i in range(p + 1):
-                size += abs(w[i])
-            for s in range(p + 1):
-                share[s] = V[p, s]
-                for j in range(p):
-                    share[s] += n[j] * V[j, s]
-                noise += abs(share[s]) * (size + abs(right[s]))
-            if worst <= epsilon * (noise + size + abs(bound)):
-                break
-            # The first to lose its multiplier leaves; among those the first to let z_1 grow, and so on.
-            for s in range(p + 1):
-                able[s] = share[s] > tie
-            for key in range(-1, p):
-                lowest = np.inf
-                for s in range(p + 1):
-                    if able[s]:
-                        lowest = min(lowest, (V[p, s] if key < 0 else -V[key, s]) / share[s])
-                left = 0
-                for s in range(p + 1):
-                    able[s] = able[s] and (V[p, s] if key < 0 else -V[key, s]) / share[s] <= lowest + tie
-                    left += able[s]
-                if left == 1:
-                    break
-            slot = -1
-            for s in range(p + 1):
-                if able[s] and (slot < 0 or share[s] > share[slot]):
-                    slot = s
-            basis[slot] = q
-        for s in range(p + 1):  # what round-off left of the rows
-            row = A[item, basis[s]] if basis[s] < m else simplex[basis[s] - m]
-            right[s] -= _dot(row, w[:p]) + w[p]
-        for i in range(p + 1):
-            ball[item, i] = w[i] + _dot(V[i], right)
-        for i in range(p):
-            open_centre[item] |= abs(far[i]) > tie
-        open_radius[item] = far[p] > tie
+def inscribed_rows(A, b, simplex, epsilon, basis, M, V, work, able):
+    """The largest ball, w = (z, r) and the rate `far` at which it grows with the simplex, and the rows that decide it.
+
+    Args:
+        A: (m, p + 1), the rows (a_j, 1), a_j of unit length.
+        b: (m,), infinite for rows to ignore.
+        simplex: (p + 1, p + 1), the rows of the simplex.
+        epsilon: the round-off of the arithmetic.
+        basis: (p + 1,), to be filled with the rows; m and above: sides of the simplex.
+        M, V: (p + 1, p + 1), to be filled; V is the inverse of the rows (a, 1), its last row the multipliers.
+        work: (4, p + 1), to be filled: right, share, w, far.
+        able: (p + 1,), scratch of booleans.
+
+    Returns:
+        Did the search end?
+    """
+    m, n = A.shape
+    right, share, w, far = work[0], work[1], work[2], work[3]
+    for s in range(n):
+        basis[s] = m + s
+    for _ in range(MOST_ROUNDS * (m + n)):
+        is_open = False
+        for s in range(n):
+            row = A[basis[s]] if basis[s] < m else simplex[basis[s] - m]
+            right[s] = b[basis[s]] if basis[s] < m else 0
+            is_open |= basis[s] >= m
+            for j in range(n):
+                M[s, j] = row[j]
+        if not invert(M, V):
+            return False
+        for i in range(n):
+            w[i], far[i] = dot(V[i], right), 0
+            for s in range(n):
+                if basis[s] >= m:
+                    far[i] += V[i, s]
+        for s in range(n):  # one correction: the rows of a sharp corner hold to round-off then
+            share[s] = right[s] - dot(A[basis[s]] if basis[s] < m else simplex[basis[s] - m], w)
+        for i in range(n):
+            w[i] += dot(V[i], share)
+
+        q, worst = -1, -np.inf
+        if is_open:  # infinitely violated rows come first, infinitely slack ones never
+            reach, fastest = 0, 0
+            for i in range(n):
+                reach += abs(far[i])
+            for j in range(m):
+                if b[j] < np.inf:
+                    rate = dot(A[j], far)
+                    if rate > epsilon * reach and rate > fastest:
+                        q, worst, fastest = j, np.inf, rate
+                    elif fastest == 0 and rate >= -epsilon * reach:
+                        over = dot(A[j], w) - b[j]
+                        if over > worst:
+                            q, worst = j, over
+        else:
+            q, worst = most_violated(A, b, w)
+        if q < 0:
+            return True
+        size, spread, propagated = 0, 0, 0
+        for i in range(n):
+            size += abs(w[i])
+            for s in range(n):
+                spread += abs(A[q, i] * V[i, s])
+        for s in range(n):
+            share[s], largest = 0, 0
+            for j in range(n):
+                share[s] += A[q, j] * V[j, s]
+                largest = max(largest, abs(V[j, s]))
+            able[s] = share[s] > epsilon * spread * largest
+            propagated += abs(share[s]) * (size + abs(right[s]))
+        if worst <= ROUND_OFF * (size + abs(b[q])) + epsilon * propagated:
+            return True
+        slot = leaving(V, share, able, epsilon)
+        if slot < 0:
+            return False
+        basis[slot] = q
+    return False
+
+
+@item
+@no_type_check
+def leaving(V, share, able, tie):
+    """The place in the basis that goes, among those `able` to: the first to lose its multiplier, among those the first
+    to let z_1 grow, and so on, among those the largest pivot; -1: none is able to."""
+    n = len(share)
+    for key in range(-1, n - 1):
+        lowest, left, size = np.inf, 0, 0
+        for s in range(n):
+            size += abs(V[key, s])
+            if able[s]:
+                ratio = (V[key, s] if key < 0 else -V[key, s]) / share[s]
+                lowest = ratio if ratio < lowest else lowest
+        for s in range(n):
+            if able[s]:
+                beyond = (V[key, s] if key < 0 else -V[key, s]) - lowest * share[s]
+                able[s] = beyond <= tie * size
+                left += able[s]
+        if left <= 1:
+            break
+    slot = -1
+    for s in range(n):
+        if able[s] and (slot < 0 or share[s] > share[slot]):
+            slot = s
+    return slot

@@ -1,7 +1,15 @@
-r"""The programmes of `exact`, and the first derivatives of `programmes`, in scalar code compiled by numba.
+r"""Two convex programmes over half-spaces {z : A z <= b}, item by item, and their vector-Jacobian products.
 
-`exact` and the backward passes of `programmes` are the reference, in the same order and with the same names; tests
-compare the two. On one item, where every operation of numpy or torch has its price, these are several times faster.
+    nearest point     min 1/2 (z - y)' H (z - y)   s.t.  A z <= b                 H z + N' mu = H y,  N z = b
+    inscribed ball    max r                        s.t.  a_j.z + |a_j| r <= b_j   (a_j, |a_j|) w = b_j
+
+N are the active rows. They are searched for (`active_rows`) in a frame in which the rows are unit ones, the point is the
+origin and the metric H = L L' is the identity: x = L'(z - y). The solution of the active rows is then corrected once with
+the given rows, which removes the round-off of the frame, and verified: a_j.z <= b_j for all rows, equality for the active
+ones, mu >= 0, and stationarity, each up to `VERIFIED` times the sizes of the numbers that meet there. What fails has the
+status UNSOLVED; `programmes.exact` then asks `programmes.rational`.
+
+Rows are scaled by powers of two before anything is squared, so that rows of any length are right.
 """
 
 from __future__ import annotations
@@ -10,159 +18,465 @@ import math
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
 
-from torchfsid.kernels.active_rows import inscribed_rows, nearest_rows, solve_active
+from torchfsid.kernels.active_rows import dot, inscribed_rows, nearest_rows, on_rows, orthogonalise, solve_upper
+from torchfsid.kernels.compiled import item, launcher
+from torchfsid.outcome import ProgrammeStatus
+from torchfsid.tolerances import ROUND_OFF, VERIFIED
 
-compiled = njit(cache=True, error_model="numpy", nogil=True)  # no_type_check: these must stay plain functions
+OK, EMPTY, UNBOUNDED = int(ProgrammeStatus.OK), int(ProgrammeStatus.EMPTY), int(ProgrammeStatus.UNBOUNDED)
+DEGENERATE, UNDEFINED = int(ProgrammeStatus.DEGENERATE), int(ProgrammeStatus.UNDEFINED)
+UNSOLVED = int(ProgrammeStatus.UNSOLVED)
+IMPOSSIBLE, BOUNDLESS = -1, -2  # EMPTY by a row 0.z <= b < 0, and UNBOUNDED for want of a largest ball: no finite radius
 
-OK, EMPTY, UNBOUNDED, DEGENERATE, UNDEFINED = 0, 1, 2, 3, 4  # `exact.Status`
 
-
-@compiled
+@item
 @no_type_check
-def _unit(A, b, y, unit, offsets, status):
-    """Unit rows, and offsets from y; infinite for zero rows. The status says what is known already."""
-    B, m, p = A.shape
-    for item in range(B):
-        total = 0.0
+def power_of_two(row):
+    """The power of two just above the largest entry; 1 for a zero row."""
+    largest = 0.0
+    for j in range(len(row)):
+        largest = max(largest, abs(row[j]))
+    mantissa, _ = math.frexp(largest)
+    return largest / mantissa if largest > 0 else 1.0
+
+
+@item
+@no_type_check
+def cholesky(H, L):
+    """H = L L'. Is H symmetric and positive definite?"""
+    p = len(H)
+    for j in range(p):
+        for i in range(p):
+            if not (math.isfinite(H[i, j]) and H[i, j] == H[j, i]):
+                return False
+            L[i, j] = 0.0
+    for j in range(p):
+        square = H[j, j]
+        for k in range(j):
+            square -= L[j, k] ** 2
+        if not square > 0.0:
+            return False
+        L[j, j] = math.sqrt(square)
+        for i in range(j + 1, p):
+            total = H[i, j]
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            L[i, j] = total / L[j, j]
+    return True
+
+
+@item
+@no_type_check
+def whiten(L, v):
+    """v becomes L^-1 v."""
+    for i in range(len(v)):
+        for j in range(i):
+            v[i] -= L[i, j] * v[j]
+        v[i] /= L[i, i]
+
+
+@item
+@no_type_check
+def unwhiten(L, x):
+    """x becomes L'^-1 x."""
+    for i in range(len(x) - 1, -1, -1):
+        for j in range(i + 1, len(x)):
+            x[i] -= L[j, i] * x[j]
+        x[i] /= L[i, i]
+
+
+@item
+@no_type_check
+def to_frame(A, b, y, L, metric, unit, offsets, sizes, lengths):
+    """The rows in the frame of the point y and the metric L L' (`metric`: is there one?).
+
+    Args:
+        unit: (m, p), to be filled with unit rows, 0 for zero rows.
+        offsets: (m,), to be filled with bounds, infinite for zero rows.
+        sizes: (m,), to be filled with the sizes of the numbers behind the offsets.
+        lengths: (m, 2), to be filled: a row's power of two, and what is left of its length in the frame.
+
+    Returns:
+        UNDEFINED if a number is not finite, EMPTY if a row 0.z <= b has b < 0, else OK.
+    """
+    m, p = A.shape
+    status = OK
+    for j in range(p):
+        if not math.isfinite(y[j]):
+            status = UNDEFINED
+    for r in range(m):
+        power = power_of_two(A[r])
+        offset, size, square = b[r] / power, abs(b[r] / power), 0.0
+        finite = math.isfinite(b[r])
         for j in range(p):
-            total += y[item, j]
-        for r in range(m):
-            total += b[item, r]
-            for j in range(p):
-                total += A[item, r, j]
-        status[item] = OK if math.isfinite(total) else UNDEFINED
-        for r in range(m):
-            squared, offset = 0.0, b[item, r]
-            for j in range(p):
-                squared += A[item, r, j] ** 2
-                offset -= A[item, r, j] * y[item, j]
-            is_row = squared > 0 and math.isfinite(total)
-            if squared == 0 and offset < 0:
-                status[item] = EMPTY
-            norm = math.sqrt(squared) if is_row else 1.0
-            offsets[item, r] = offset / norm if is_row else np.inf
-            for j in range(p):
-                unit[item, r, j] = A[item, r, j] / norm if is_row else 0.0
+            finite = finite and math.isfinite(A[r, j])
+            part = A[r, j] / power
+            unit[r, j] = part
+            offset -= part * y[j]
+            size += abs(part * y[j])
+        if metric:
+            whiten(L, unit[r])
+        for j in range(p):
+            square += unit[r, j] ** 2
+        length = math.sqrt(square)
+        if not finite:
+            status = UNDEFINED
+        elif square == 0.0 and b[r] < 0.0 and status == OK:
+            status = EMPTY
+        is_row = finite and square > 0.0
+        lengths[r, 0], lengths[r, 1] = power, length
+        offsets[r] = offset / length if is_row else np.inf
+        sizes[r] = size / length if is_row else 0.0
+        for j in range(p):
+            unit[r, j] = unit[r, j] / length if is_row else 0.0
+    return status
 
 
-@compiled
+@item
 @no_type_check
-def nearest_point(A, b, y, parallel, epsilon, most_rounds, z, mu, rows, filled, status):
-    """Into the last five."""
-    B, m, p = A.shape
-    unit, offsets = np.empty((B, m, p)), np.empty((B, m))
-    _unit(A, b, y, unit, offsets, status)
-    step, count, empty = np.zeros((B, p)), np.zeros(B, dtype=np.int64), np.zeros(B, dtype=np.bool_)
-    nearest_rows(unit, offsets, parallel, epsilon, most_rounds, step, rows, count, mu, empty)
-    # Once more, as a correction: this removes the round-off of a distant y, and gives the given rows' own multipliers.
-    N, right, pull, correction = np.zeros((B, p, p)), np.zeros((B, p)), np.zeros((B, p)), np.zeros((B, p))
-    for item in range(B):
-        if status[item] == OK and empty[item]:
-            status[item] = EMPTY
-        if status[item] != OK:
+def solve_rows(N, k, pull, offsets, Q, D, R, work, z, mu):
+    """z + N' mu = pull, N z = offsets for the first k rows of N: in the span of the rows z follows from the offsets,
+    beyond it from the pull. A row that depends on those before it counts for nothing."""
+    p = len(z)
+    y, e, d = work[0], work[1], work[2]
+    for s in range(k):
+        for j in range(p):
+            Q[s, j] = N[s, j]
+        orthogonalise(Q[s], Q, D, s, R[:, s])
+        D[s] = dot(Q[s], Q[s])
+        if D[s] <= ROUND_OFF**2 * dot(N[s], N[s]):
+            D[s] = np.inf
+    on_rows(offsets, Q, D, R, k, y, z)
+    for j in range(p):
+        d[j] = pull[j]
+    orthogonalise(d, Q, D, k, e)
+    for s in range(k):
+        e[s] -= y[s]
+    for j in range(p):
+        z[j] += d[j]
+    solve_upper(R, e, k, mu)
+
+
+@item
+@no_type_check
+def finish_nearest(A, b, y, L, metric, unit, sizes, lengths, rows, k, Q, D, R, work, N, x, z, mu):
+    """From the active rows and the point x in the frame: the point z, the multipliers mu of the given rows, verified.
+
+    Returns:
+        OK or UNSOLVED.
+    """
+    m, p = A.shape
+    right, pull, correction = work[3], work[4], work[5]
+    if metric:
+        unwhiten(L, x)
+    for j in range(p):
+        z[j] = y[j] + x[j]
+    for s in range(k):
+        r = rows[s]
+        right[s] = b[r] / lengths[r, 0]
+        for j in range(p):
+            N[s, j] = unit[r, j]
+            right[s] -= A[r, j] / lengths[r, 0] * z[j]
+        right[s] /= lengths[r, 1]
+    size = from_frame(L, metric, y, z, x)
+    for j in range(p):
+        pull[j] = -x[j]
+    solve_rows(N, k, pull, right, Q, D, R, work, correction, mu)
+    if metric:
+        unwhiten(L, correction)
+    for j in range(p):
+        z[j] += correction[j]
+
+    size = from_frame(L, metric, y, z, x)
+    verified, total = True, size
+    for s in range(k):
+        mu[s] = max(mu[s], 0.0)
+        total += mu[s]
+    for j in range(p):
+        left = x[j]
+        for s in range(k):
+            left += mu[s] * N[s, j]
+        verified = verified and abs(left) <= VERIFIED * total
+    for r in range(m):
+        if sizes[r] == 0.0 and lengths[r, 1] == 0.0:
             continue
+        over, around = -b[r] / lengths[r, 0], abs(b[r] / lengths[r, 0])
         for j in range(p):
-            z[item, j] = y[item, j] + step[item, j]
-            pull[item, j] = -step[item, j]
-        for s in range(count[item]):
-            filled[item, s] = True
-            right[item, s] = b[item, rows[item, s]]
-            for j in range(p):
-                N[item, s, j] = A[item, rows[item, s], j]
-                right[item, s] -= N[item, s, j] * z[item, j]
-    mu[:] = 0.0
-    solve_active(N, filled, pull, right, correction, mu)
-    for item in range(B):
-        for j in range(p):
-            z[item, j] = z[item, j] + correction[item, j] if status[item] == OK else np.nan
+            part = A[r, j] / lengths[r, 0]
+            over += part * z[j]
+            around += abs(part) * abs(z[j])
+        noise = VERIFIED * (around / lengths[r, 1] + sizes[r] + size)
+        verified = verified and over <= noise * lengths[r, 1]
+        for s in range(k):
+            if rows[s] == r:
+                verified = verified and over >= -noise * lengths[r, 1]
+    for s in range(k):
+        mu[s] = mu[s] / lengths[rows[s], 1] / lengths[rows[s], 0]
+    return OK if verified else UNSOLVED
 
 
-@compiled
+@item
 @no_type_check
-def of_nearest_point(A, rows, filled, mu, z, status, of_z, of_mu, of_A, of_b, of_y):
-    """The derivatives, into the last three."""
+def from_frame(L, metric, y, z, x):
+    """x = L'(z - y). Returns the size of the numbers that it was computed from."""
+    size = 0.0
+    for i in range(len(x)):
+        x[i] = z[i] - y[i]
+        size += abs(x[i])
+    if metric:
+        size = 0.0
+        for i in range(len(x)):
+            total = 0.0
+            for j in range(i, len(x)):
+                total += L[j, i] * x[j]
+                size += abs(L[j, i] * x[j])
+            x[i] = total
+    return size
+
+
+@launcher
+@no_type_check
+def nearest_point(A, b, y, H, z, mu, rows, filled, status):
+    """Fills the last five. H: (B, p, p), or (0, p, p) for the identity."""
+    B, m, p = A.shape
+    metric = len(H) > 0
+    unit, offsets, sizes, lengths = np.empty((m, p)), np.empty(m), np.empty(m), np.empty((m, 2))
+    L, Q, R, N = np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p))
+    D, work, x = np.zeros(p), np.zeros((6, p)), np.zeros(p)
+    for i in range(B):
+        state = OK
+        if metric and not cholesky(H[i], L):
+            state = UNDEFINED
+        else:
+            state = to_frame(A[i], b[i], y[i], L, metric, unit, offsets, sizes, lengths)
+        k = 0
+        if state == OK:
+            k, state = nearest_rows(unit, offsets, sizes, ROUND_OFF, rows[i], Q, D, R, work, x)
+        if state == OK:
+            state = finish_nearest(
+                A[i], b[i], y[i], L, metric, unit, sizes, lengths, rows[i], k, Q, D, R, work, N, x, z[i], mu[i]
+            )
+        status[i] = state
+        for s in range(p):
+            filled[i, s] = state == OK and s < k
+            if not filled[i, s]:
+                mu[i, s], rows[i, s] = 0.0, 0
+            if state != OK:
+                z[i, s] = np.nan
+
+
+@item
+@no_type_check
+def has_multipliers(A, simplex, basis, V, least, N, Q, D, R, work):
+    """Is (0, .., 0, 1) a combination with weights >= 0 of those rows of the basis whose multiplier is above `least`?"""
+    m, n = A.shape
+    pull, offsets, left, mu, k = work[3], work[4], work[5], V[n - 1], 0
+    for s in range(n):
+        pull[s], offsets[s] = 1.0 if s == n - 1 else 0.0, 0.0
+        if mu[s] > least or least == 0.0:
+            for j in range(n):
+                N[k, j] = A[basis[s], j] if basis[s] < m else simplex[basis[s] - m, j]
+            k += 1
+    solve_rows(N, k, pull, offsets, Q, D, R, work, left, pull)
+    for j in range(n):
+        if not (abs(left[j]) <= VERIFIED and (j >= k or pull[j] >= -VERIFIED)):
+            return False
+    return True
+
+
+@item
+@no_type_check
+def finish_ball(A, b, simplex, basis, V, w, far, N, Q, D, R, work):
+    """From the rows that decide the largest ball, in the frame, to its status, verified.
+
+    Args:
+        A: (m, p + 1), the rows (a_j, 1).
+        b: (m,), their bounds.
+        simplex, basis, V, w, far: see `inscribed_rows`.
+        N, Q, R: (p + 1, p + 1), scratch.
+        D: (p + 1,), scratch.
+        work: (6, p + 1), scratch.
+    """
+    m, n = A.shape
+    size, reach, largest, spread, is_open = 0.0, 0.0, 0.0, 0.0, False
+    for i in range(n):
+        for s in range(n):
+            spread += abs(V[i, s])
+        size += abs(w[i])
+        reach += abs(far[i])
+        is_open |= basis[i] >= m
+        if basis[i] < m:
+            largest = max(largest, abs(b[basis[i]]))
+    open_radius = is_open and far[n - 1] > ROUND_OFF * reach
+
+    if not (
+        has_multipliers(A, simplex, basis, V, 0.0, N, Q, D, R, work)
+        or has_multipliers(A, simplex, basis, V, ROUND_OFF * spread, N, Q, D, R, work)
+    ):
+        return UNSOLVED
+    for j in range(m):
+        if b[j] < np.inf:
+            rate = dot(A[j], far) if is_open else 0.0
+            over, noise = dot(A[j], w) - b[j], VERIFIED * (size + abs(b[j]))
+            if not rate <= VERIFIED * reach:
+                return UNSOLVED
+            if not open_radius and rate >= -VERIFIED * reach and not over <= noise:
+                return UNSOLVED
+            for s in range(n):
+                if basis[s] == j and not over >= -noise:
+                    return UNSOLVED
+    if open_radius:
+        return BOUNDLESS
+    if abs(w[n - 1]) <= ROUND_OFF * (size + largest):
+        return DEGENERATE
+    if w[n - 1] < 0.0:
+        return EMPTY
+    return UNBOUNDED if is_open else OK
+
+
+@item
+@no_type_check
+def write_ball(w, m, status, centre, rows):
+    """The centre, NaN if there is none, and the rows, none of them real if the radius does not follow from any.
+
+    Returns:
+        The radius, and the status without its private values.
+    """
+    p, radius, is_open = len(centre), w[len(centre)], False
+    for s in range(p + 1):
+        is_open |= rows[s] >= m
+    if status == UNDEFINED or status == UNSOLVED:
+        radius = np.nan
+    elif status == IMPOSSIBLE:
+        radius = -np.inf
+    elif status == BOUNDLESS:
+        radius = np.inf
+    for j in range(p):
+        centre[j] = w[j] if math.isfinite(radius) and not is_open else np.nan
+    if not math.isfinite(radius):
+        for s in range(p + 1):
+            rows[s] = m + s
+    if status == IMPOSSIBLE or status == BOUNDLESS:
+        status = EMPTY if status == IMPOSSIBLE else UNBOUNDED
+    return radius, status
+
+
+@launcher
+@no_type_check
+def inscribed_ball(A, b, simplex, centre, radius, rows, status):
+    """Fills the last four."""
+    B, m, p = A.shape
+    unit, offsets, sizes, lengths = np.ones((m, p + 1)), np.empty(m), np.empty(m), np.empty((m, 2))
+    M, V, work, able = np.zeros((p + 1, p + 1)), np.zeros((p + 1, p + 1)), np.zeros((4, p + 1)), np.zeros(p + 1, np.bool_)
+    origin, L = np.zeros(p), np.zeros((p, p))
+    Q, D, R, scratch = np.zeros((p + 1, p + 1)), np.zeros(p + 1), np.zeros((p + 1, p + 1)), np.zeros((6, p + 1))
+    w, far = work[2], work[3]
+    for i in range(B):
+        state = to_frame(A[i], b[i], origin, L, False, unit[:, :p], offsets, sizes, lengths)
+        if state == EMPTY:
+            state = IMPOSSIBLE
+        elif state == OK:
+            state = UNSOLVED
+            if inscribed_rows(unit, offsets, simplex, ROUND_OFF, rows[i], M, V, work, able):
+                state = finish_ball(unit, offsets, simplex, rows[i], V, w, far, M, Q, D, R, scratch)
+        radius[i], status[i] = write_ball(w, m, state, centre[i], rows[i])
+
+
+@item
+@no_type_check
+def solve_given(N, k, pull, offsets, L, metric, rows, Q, D, R, work, z, mu):
+    """H z + N' mu = pull, N z = offsets, for the first k rows of N, of any length: fills the last two. Scratch before."""
+    right, given = work[3], work[4]
+    for s in range(k):
+        power = power_of_two(N[s])
+        for j in range(len(z)):
+            rows[s, j] = N[s, j] / power
+        right[s] = offsets[s] / power
+        if metric:
+            whiten(L, rows[s])
+    for j in range(len(z)):
+        given[j] = pull[j]
+    if metric:
+        whiten(L, given)
+    solve_rows(rows, k, given, right, Q, D, R, work, z, mu)
+    if metric:
+        unwhiten(L, z)
+    for s in range(k):
+        mu[s] /= power_of_two(N[s])
+
+
+@launcher
+@no_type_check
+def solve_active(N, filled, pull, offsets, H, z, mu):
+    """H z + N' mu = pull, N z = offsets, for the first rows of N, `filled`: fills the last two.
+    H: (B, p, p), or (0, p, p) for the identity."""
+    B, n, p = N.shape
+    metric = len(H) > 0
+    L, Q, R, rows = np.zeros((p, p)), np.zeros((n, p)), np.zeros((n, n)), np.zeros((n, p))
+    D, work = np.zeros(n), np.zeros((6, max(n, p)))
+    for i in range(B):
+        k = 0
+        while k < n and filled[i, k]:
+            k += 1
+        if metric and not cholesky(H[i], L):
+            for j in range(p):
+                z[i, j] = np.nan
+        else:
+            solve_given(N[i], k, pull[i], offsets[i], L, metric, rows, Q, D, R, work, z[i], mu[i])
+
+
+@launcher
+@no_type_check
+def nearest_point_vjp(A, rows, filled, mu, z, status, grad_z, grad_mu, grad_A, grad_b, grad_y):
+    """The vector-Jacobian products of the nearest point in the metric I: fills the last three, which are zero before."""
     B, p = z.shape
-    N, pull, v = np.zeros((B, p, p)), np.zeros((B, p)), np.zeros((B, p))
-    for item in range(B):
-        for s in range(p):
-            if status[item] == OK:
-                pull[item, s] = of_z[item, s]
+    L, Q, R, N, scaled = np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p))
+    D, work, u, v = np.zeros(p), np.zeros((6, p)), np.zeros(p), np.zeros(p)
+    for i in range(B):
+        if status[i] != OK:
+            continue
+        k = 0
+        while k < p and filled[i, k]:
             for j in range(p):
-                N[item, s, j] = A[item, rows[item, s], j]
-    solve_active(N, filled, pull, of_mu, of_y, v)
-    for item in range(B):
-        for s in range(p):
-            if filled[item, s]:
-                of_b[item, rows[item, s]] += v[item, s]
-                for j in range(p):
-                    slope = mu[item, s] * of_y[item, j] + v[item, s] * z[item, j]
-                    of_A[item, rows[item, s], j] -= slope
-
-
-@compiled
-@no_type_check
-def inscribed_ball(A, b, simplex, tie, epsilon, most_rounds, centre, radius, rows, status):
-    """Into the last four."""
-    B, m, p = A.shape
-    unit, offsets, ball = np.empty((B, m, p)), np.empty((B, m)), np.zeros((B, p + 1))
-    open_centre, open_radius = np.zeros(B, dtype=np.bool_), np.zeros(B, dtype=np.bool_)
-    _unit(A, b, np.zeros((B, p)), unit, offsets, status)
-    inscribed_rows(unit, offsets, simplex, tie, epsilon, most_rounds, ball, rows, open_centre, open_radius)
-    for item in range(B):
-        radius[item], size, largest = ball[item, p], abs(ball[item, p]), 0.0
+                N[k, j] = A[i, rows[i, k], j]
+            k += 1
+        solve_given(N, k, grad_z[i], grad_mu[i], L, False, scaled, Q, D, R, work, u, v)
         for j in range(p):
-            centre[item, j] = ball[item, j]
-            size += abs(ball[item, j])
-        for s in range(p + 1):
-            if rows[item, s] < m:
-                largest = max(largest, abs(offsets[item, rows[item, s]]))
-        undecided = status[item] != OK or open_radius[item]
-        if status[item] == UNDEFINED:
-            radius[item] = np.nan
-        elif status[item] == EMPTY:
-            radius[item] = -np.inf
-        elif open_radius[item]:
-            radius[item], status[item] = np.inf, UNBOUNDED
-        elif abs(radius[item]) <= epsilon * (size + largest):
-            status[item] = DEGENERATE
-        elif radius[item] < 0:
-            status[item] = EMPTY
-        elif open_centre[item]:
-            status[item] = UNBOUNDED
-        if undecided or open_centre[item]:
-            centre[item, :] = np.nan
-        if undecided:
-            for s in range(p + 1):
-                rows[item, s] = m + s
-
-
-@compiled
-@no_type_check
-def of_inscribed_ball(A, centre, radius, rows, simplex, of_centre, of_radius, of_A, of_b):
-    """The derivatives, into the last two."""
-    B, m, p = A.shape
-    M, pull, nothing = np.zeros((B, p + 1, p + 1)), np.zeros((B, p + 1)), np.zeros((B, p + 1))
-    every, v, ignored = np.ones((B, p + 1), dtype=np.bool_), np.zeros((B, p + 1)), np.zeros((B, p + 1))
-    for item in range(B):
-        for s in range(p + 1):
-            row = A[item, rows[item, s]] if rows[item, s] < m else simplex[rows[item, s] - m]
-            squared = 0.0
+            grad_y[i, j] = u[j]
+        for s in range(k):
+            grad_b[i, rows[i, s]] += v[s]
             for j in range(p):
-                M[item, s, j] = row[j]
-                squared += row[j] ** 2
-            M[item, s, p] = math.sqrt(squared)
+                grad_A[i, rows[i, s], j] -= mu[i, s] * u[j] + v[s] * z[i, j]
+
+
+@launcher
+@no_type_check
+def inscribed_ball_vjp(A, centre, radius, rows, simplex, grad_centre, grad_radius, grad_A, grad_b):
+    """The vector-Jacobian products of the largest ball: fills the last two, which are zero before."""
+    B, m, p = A.shape
+    n = p + 1
+    L, Q, R, N, scaled = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
+    D, work, nothing, v, u = np.zeros(n), np.zeros((6, n)), np.zeros(n), np.zeros(n), np.zeros(n)
+    pull = np.zeros(n)
+    for i in range(B):
+        if not math.isfinite(radius[i]):
+            continue
+        has_centre = math.isfinite(centre[i, 0])
+        for s in range(n):
+            real = rows[i, s] < m
+            power, square = power_of_two(A[i, rows[i, s]]) if real else 1.0, 0.0
+            for j in range(p):
+                N[s, j] = A[i, rows[i, s], j] if real else simplex[rows[i, s] - m, j]
+                square += (N[s, j] / power) ** 2
+            N[s, p] = power * math.sqrt(square)
         for j in range(p):
-            pull[item, j] = of_centre[item, j] if math.isfinite(centre[item, j]) else 0.0
-        pull[item, p] = of_radius[item] if math.isfinite(radius[item]) else 0.0
-    solve_active(M, every, pull, nothing, ignored, v)
-    for item in range(B):
-        for s in range(p + 1):
-            if rows[item, s] < m:
-                of_b[item, rows[item, s]] += v[item, s]
+            pull[j] = grad_centre[i, j] if has_centre else 0.0
+        pull[p] = grad_radius[i]
+        solve_given(N, n, pull, nothing, L, False, scaled, Q, D, R, work, u, v)
+        for s in range(n):
+            if rows[i, s] < m:
+                grad_b[i, rows[i, s]] += v[s]
                 for j in range(p):
-                    at = centre[item, j] if math.isfinite(centre[item, j]) else 0.0
-                    if math.isfinite(radius[item]):
-                        at += radius[item] * M[item, s, j] / M[item, s, p]
-                    of_A[item, rows[item, s], j] -= v[item, s] * at
+                    at = centre[i, j] if has_centre else 0.0
+                    grad_A[i, rows[i, s], j] -= v[s] * (at + radius[i] * (N[s, j] / N[s, p]))

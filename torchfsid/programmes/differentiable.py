@@ -15,7 +15,6 @@ whose condition is that of the rows squared, is never formed.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from inspect import signature
 from typing import Any, NamedTuple
 
@@ -27,9 +26,8 @@ from torch import Tensor
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.outcome import ProgrammeStatus
-from torchfsid.programmes import active_rows, exact
-from torchfsid.programmes.active_rows import simplex_around
-from torchfsid.tolerances import PARALLEL_ROWS
+from torchfsid.programmes import exact
+from torchfsid.programmes.exact import simplex_around
 
 
 class NearestPoint(NamedTuple):
@@ -59,12 +57,10 @@ def nearest_point(
     return NearestPoint(found.to(point.dtype), status)
 
 
-def nearest(
-    halfspaces: Halfspaces, y: Tensor, metric: Tensor | None = None, parallel: float = PARALLEL_ROWS
-) -> tuple[Tensor, ...]:
+def nearest(halfspaces: Halfspaces, y: Tensor, metric: Tensor | None = None) -> tuple[Tensor, ...]:
     """The point, the multipliers mu, the active rows, which of their places are filled, and the status, for `broadcast`
-    arguments. The two first have gradients. Rows less than `parallel` [rad] apart may count as parallel."""
-    return _NearestPoint.apply(halfspaces.A, halfspaces.b, y, metric, parallel)  # type: ignore[return-value]
+    arguments. The two first have gradients."""
+    return _NearestPoint.apply(halfspaces.A, halfspaces.b, y, metric)  # type: ignore[return-value]
 
 
 def inscribed_ball(halfspaces: Halfspaces) -> InscribedBall:
@@ -130,35 +126,34 @@ class _NearestPoint(torch.autograd.Function):
 
     @staticmethod
     @_signed
-    def forward(A: Tensor, b: Tensor, y: Tensor, metric: Tensor | None, parallel: float) -> tuple[Tensor, ...]:
-        search = partial(exact.nearest_point, parallel=parallel)
-        return on_arrays(search, *((A, b, y) if metric is None else (A, b, y, metric)))
+    def forward(A: Tensor, b: Tensor, y: Tensor, metric: Tensor | None) -> tuple[Tensor, ...]:
+        return on_arrays(exact.nearest_point, *((A, b, y) if metric is None else (A, b, y, metric)))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
-        A, _, y, metric, _ = inputs
+        A, _, y, metric = inputs
         ctx.mark_non_differentiable(*output[2:])
         ctx.save_for_backward(A, y, metric, *output)
         ctx.save_for_forward(A, y, metric, *output)
 
     @staticmethod
-    def backward(ctx: Any, of_z: Tensor, of_mu: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, grad_z: Tensor, grad_mu: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
         A, y, metric, z, mu, rows, filled, status = ctx.saved_tensors
         if metric is None and _first_derivatives_suffice():
             saved = A, rows, filled, mu, z, status
-            return *on_arrays(exact.of_nearest_point, *saved, of_z, of_mu), None, None
+            return *on_arrays(exact.nearest_point_vjp, *saved, grad_z, grad_mu), None
         ok = status.unsqueeze(-1) == ProgrammeStatus.OK
         z, metric = torch.where(ok, z, 0.0), _definite(metric, ok)
         N, index = _taken(A, rows)
-        u, v = _SolveActive.apply(N, filled, torch.where(ok, of_z, 0.0), of_mu, metric)  # type: ignore[misc]
-        of_A = torch.zeros_like(A).scatter_add(-2, index, _of_rows(mu, u, v, z))
-        of_b = torch.zeros_like(A[..., 0]).scatter_add(-1, rows, v)
+        u, v = _SolveActive.apply(N, filled, torch.where(ok, grad_z, 0.0), grad_mu, metric)  # type: ignore[misc]
+        grad_A = torch.zeros_like(A).scatter_add(-2, index, _of_rows(mu, u, v, z))
+        grad_b = torch.zeros_like(A[..., 0]).scatter_add(-1, rows, v)
         if metric is None:
-            return of_A, of_b, u, None, None
-        return of_A, of_b, times(metric, u), u.unsqueeze(-1) * torch.where(ok, y - z, 0.0).unsqueeze(-2), None
+            return grad_A, grad_b, u, None
+        return grad_A, grad_b, times(metric, u), u.unsqueeze(-1) * torch.where(ok, y - z, 0.0).unsqueeze(-2)
 
     @staticmethod
-    def jvp(ctx: Any, dA: Any, db: Any, dy: Any, dmetric: Any, _: None) -> tuple[Tensor | None, ...]:
+    def jvp(ctx: Any, dA: Any, db: Any, dy: Any, dmetric: Any) -> tuple[Tensor | None, ...]:
         A, y, metric, z, mu, rows, filled, status = ctx.saved_tensors
         ok = status.unsqueeze(-1) == ProgrammeStatus.OK
         z, metric = torch.where(ok, z, 0.0), _definite(metric, ok)
@@ -173,8 +168,8 @@ class _NearestPoint(torch.autograd.Function):
             pull = pull + (dy if metric is None else times(metric, dy))
         if dmetric is not None:
             pull = pull + times(dmetric, y - z)
-        step, of_mu = _SolveActive.apply(N, filled, torch.where(ok, pull, 0.0), offsets, metric)  # type: ignore[misc]
-        return step, of_mu, None, None, None
+        step, dmu = _SolveActive.apply(N, filled, torch.where(ok, pull, 0.0), offsets, metric)  # type: ignore[misc]
+        return step, dmu, None, None, None
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *inputs: Tensor | float | None) -> tuple:
@@ -203,9 +198,9 @@ class _SolveActive(torch.autograd.Function):
         ctx.save_for_forward(N, filled, metric, *output)
 
     @staticmethod
-    def backward(ctx: Any, of_z: Tensor, of_mu: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, grad_z: Tensor, grad_mu: Tensor) -> tuple[Tensor | None, ...]:
         N, filled, metric, z, mu = ctx.saved_tensors
-        u, v = _SolveActive.apply(N, filled, of_z, of_mu, metric)  # type: ignore[misc]
+        u, v = _SolveActive.apply(N, filled, grad_z, grad_mu, metric)  # type: ignore[misc]
         return _of_rows(mu, u, v, z), None, u, v, None if metric is None else -u.unsqueeze(-1) * z.unsqueeze(-2)
 
     @staticmethod
@@ -243,26 +238,26 @@ class _InscribedBall(torch.autograd.Function):
         """The rows (a, |a|), where the ball touches them, which are real ones, and their index."""
         real, rows = rows < A.shape[-2], rows.clamp(max=A.shape[-2] - 1)
         N, index = _taken(A, rows)
-        N = torch.where(real.unsqueeze(-1), N, torch.as_tensor(simplex_around(A.shape[-1]), device=A.device))
+        N = torch.where(real.unsqueeze(-1), N, torch.as_tensor(simplex_around(A.shape[-1])[:, :-1], device=A.device))
         norms = torch.linalg.vector_norm(N, dim=-1, keepdim=True)
         touching = _finite(centre).unsqueeze(-2) + _finite(radius)[..., None, None] * N / norms
         return torch.cat([N, norms], dim=-1), touching, real, rows, index
 
     @staticmethod
-    def backward(ctx: Any, of_centre: Tensor, of_radius: Tensor, *_: Tensor) -> tuple[Tensor, Tensor]:
+    def backward(ctx: Any, grad_centre: Tensor, grad_radius: Tensor, *_: Tensor) -> tuple[Tensor, Tensor]:
         A, centre, radius, rows = ctx.saved_tensors
         if _first_derivatives_suffice():
-            of_A, of_b = on_arrays(exact.of_inscribed_ball, A, centre, radius, rows, of_centre, of_radius)
-            return of_A, of_b
+            grad_A, grad_b = on_arrays(exact.inscribed_ball_vjp, A, centre, radius, rows, grad_centre, grad_radius)
+            return grad_A, grad_b
         M, touching, real, rows, index = _InscribedBall._system(A, centre, radius, rows)
-        given = torch.cat([of_centre, of_radius.unsqueeze(-1)], dim=-1)
+        given = torch.cat([grad_centre, grad_radius.unsqueeze(-1)], dim=-1)
         found = torch.cat([centre, radius.unsqueeze(-1)], dim=-1).isfinite()
         # Not by linalg.solve: its forward derivative over a backward one is wrong under vmap (torch 2.13).
         given, every = torch.where(found, given, 0.0), torch.ones_like(real)
         _, v = _SolveActive.apply(M, every, given, torch.zeros_like(given), None)  # type: ignore[misc]
         v = torch.where(real, v, 0.0)
-        of_A = torch.zeros_like(A).scatter_add(-2, index, -v.unsqueeze(-1) * touching)
-        return of_A, torch.zeros_like(A[..., 0]).scatter_add(-1, rows, v)
+        grad_A = torch.zeros_like(A).scatter_add(-2, index, -v.unsqueeze(-1) * touching)
+        return grad_A, torch.zeros_like(A[..., 0]).scatter_add(-1, rows, v)
 
     @staticmethod
     def jvp(ctx: Any, dA: Any, db: Any) -> tuple[Tensor | None, ...]:
@@ -287,7 +282,7 @@ def _finite(values: Tensor) -> Tensor:
 
 def _first_derivatives_suffice() -> bool:
     """Then they can be compiled: no graph of them is asked for, and no transform (vmap, jvp) looks through them."""
-    return active_rows.installed() and not torch.is_grad_enabled() and not torch._C._are_functorch_transforms_active()
+    return not torch.is_grad_enabled() and not torch._C._are_functorch_transforms_active()
 
 
 def _taken(A: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:

@@ -24,7 +24,6 @@ from torchfsid.programmes.differentiable import broadcast, nearest
 from torchfsid.robots.barriers import Barrier, is_joint
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.tasks import Task
-from torchfsid.tolerances import PARALLEL_ACTIVE_ROWS
 
 
 class QpSolution(NamedTuple):
@@ -55,7 +54,7 @@ def solve_safe_qp(safe_controls: Halfspaces, uhat: Float[Tensor, "*batch n"]) ->
     if uhat.shape[-1:] != (n,):
         raise InputError("uhat", f"(*batch, {n})", tuple(uhat.shape))
     rows, y, _ = broadcast(safe_controls, uhat)
-    nearest_control, mu, places, filled, status = nearest(rows, y, parallel=PARALLEL_ACTIVE_ROWS)
+    nearest_control, mu, places, filled, status = nearest(rows, y)
     feasible = status == ProgrammeStatus.OK
     u = torch.where(feasible.unsqueeze(-1), nearest_control, 0.0)
     held = torch.where(filled, 2 * mu.clamp(min=0), 0.0)
