@@ -221,17 +221,17 @@ def finish_nearest(A, b, y, L, metric, unit, sizes, lengths, rows, k, Q, D, T, w
 @no_type_check
 def from_frame(L, metric, y, z, x):
     """x = L'(z - y). Returns the size of the numbers that it was computed from."""
-    size = 0.0
-    for i in range(len(x)):
+    p, size = len(x), 0.0
+    for i in range(p):
         x[i] = z[i] - y[i]
-        size += abs(x[i])
+        if not metric:
+            size += abs(z[i]) + abs(y[i])
     if metric:
-        size = 0.0
-        for i in range(len(x)):
+        for i in range(p):
             total = 0.0
-            for j in range(i, len(x)):
+            for j in range(i, p):
                 total += L[j, i] * x[j]
-                size += abs(L[j, i] * x[j])
+                size += abs(L[j, i]) * (abs(z[j]) + abs(y[j]))
             x[i] = total
     return size
 

@@ -60,15 +60,17 @@ def inscribed_ball(A: Array, b: Array, simplex: Array, centre: Array, rows: Arra
     real = np.flatnonzero(offsets < np.inf)
     basis, able = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=bool)
     M, V, work = (fractions(np.zeros(shape)) for shape in ((n, n), (n, n), (5, n)))
-    found = inscribed_rows(
-        fractions(unit[real]), fractions(offsets[real]), fractions(simplex), 0, basis, M, V, work, able
-    )
-    rows[:] = np.where(basis < len(real), np.append(real, np.arange(n))[basis], basis - len(real) + m)
+    # The rows as they were given, up to powers of two, and their lengths.
+    N = np.column_stack([A[real] * lengths[real, :1], lengths[real, 1]])
+    o, sides = fractions(b[real] * lengths[real, 0]), fractions(simplex)
+    found = inscribed_rows(fractions(N), o, sides, 0, basis, M, V, work, able)
+    rows[:] = np.append(real, m + np.arange(n))[basis]
     w, far = work[2:4].astype(float)
     status = kernel.UNSOLVED
     if found:
+        inverse = (V * np.append(lengths[real, 1], np.ones(n))[basis]).astype(float)
         scratch = [np.zeros(shape) for shape in ((n, n), (n, n), n, (n, n), (6, n))]
-        status = kernel.finish_ball(unit, offsets, simplex, rows, V.astype(float), w, far, *scratch)
+        status = kernel.finish_ball(unit, offsets, simplex, rows, inverse, w, far, *scratch)
     return kernel.write_ball(w, m, status, centre, rows)
 
 
