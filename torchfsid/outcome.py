@@ -28,8 +28,8 @@ class ProgrammeStatus(IntEnum):
     UNDEFINED = 4
     """A row or the point is NaN or infinite, or the metric is not positive definite."""
     UNSOLVED = 5
-    """No answer could be verified, not even one in rational arithmetic: numbers of very different sizes meet, or round-off
-    overflows. Ask in other units or nearer to the origin (shifted and scaled, the set's width being about 1)."""
+    """No answer could be verified, not even one in rational arithmetic: numbers of very different sizes meet.
+    Ask nearer to the origin and in other units (shifted and scaled until the set's width is about 1)."""
 
 
 class FilterStatus(IntEnum):

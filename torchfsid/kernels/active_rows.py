@@ -9,7 +9,7 @@ row that it violates most enters, until none is violated.
 The nearest point is found after Goldfarb and Idnani (Math. Programming 27, 1983). The active rows are made orthogonal
 one by one, a_s = Q_s + sum_i<s T_si Q_i. An entering row n is n = sum_s c_s a_s + d, d orthogonal to all of them.
 Pushing it by t changes the multipliers by -t c and its violation by -t |d|^2. A multiplier that reaches zero first
-leaves. If d = 0 and no multiplier can leave, then n - sum_s c_s a_s = 0 is a combination of rows with weights >= 0 whose
+leaves. If d = 0 and no multiplier can leave, then n - sum_s c_s a_s = 0 combines rows with weights >= 0, and their
 bounds contradict each other: the set is empty.
 
 The inscribed ball is found by the dual simplex method with lexicographic ratios. They cannot cycle, and they make the
@@ -29,78 +29,11 @@ from typing import no_type_check
 import numpy as np
 
 from torchfsid.kernels.compiled import item
+from torchfsid.kernels.linear import dot, invert, on_rows, orthogonalise, solve_upper
 from torchfsid.outcome import ProgrammeStatus
 from torchfsid.tolerances import CLEARLY_EMPTY, MOST_ROUNDS, ROUND_OFF
 
 OK, EMPTY, UNSOLVED = int(ProgrammeStatus.OK), int(ProgrammeStatus.EMPTY), int(ProgrammeStatus.UNSOLVED)
-
-
-@item
-@no_type_check
-def dot(v, w):
-    total = 0
-    for i in range(len(v)):
-        total += v[i] * w[i]
-    return total
-
-
-@item
-@no_type_check
-def orthogonalise(v, Q, D, k, share):
-    """Take from v what lies in the span of the first k rows of Q: v loses share_i Q_i. D_i = 1 / |Q_i|^2.
-
-    Twice, if little is left, so that what is left is orthogonal to round-off.
-
-    Returns:
-        |v|^2, of what is left.
-    """
-    square, left = 0, 0
-    for j in range(len(v)):
-        square += v[j] * v[j]
-    for i in range(k):
-        share[i] = 0
-    for _ in range(2):
-        for i in range(k):
-            part = 0
-            for j in range(len(v)):
-                part += Q[i, j] * v[j]
-            part *= D[i]
-            share[i] += part
-            for j in range(len(v)):
-                v[j] -= part * Q[i, j]
-        left = 0
-        for j in range(len(v)):
-            left += v[j] * v[j]
-        if k == 0 or 4 * left > square:
-            break
-    return left
-
-
-@item
-@no_type_check
-def solve_upper(T, right, k, x):
-    """sum_s x_s a_s = sum_i right_i Q_i for the k rows a_s = Q_s + sum_i<s T_si Q_i."""
-    for i in range(k - 1, -1, -1):
-        x[i] = right[i]
-        for j in range(i + 1, k):
-            x[i] -= T[j, i] * x[j]
-
-
-@item
-@no_type_check
-def on_rows(b, Q, D, T, k, y, z):
-    """z = sum_i y_i Q_i with a_s.z = b_s for the k rows a_s = Q_s + sum_i<s T_si Q_i."""
-    for j in range(len(z)):
-        z[j] = 0
-    for s in range(k):
-        c = b[s]  # y_s |Q_s|^2
-        for i in range(s):
-            c -= T[s, i] * y[i]
-        y[s] = c
-    for s in range(k):
-        y[s] *= D[s]
-        for j in range(len(z)):
-            z[j] += y[s] * Q[s, j]
 
 
 @item
@@ -209,37 +142,6 @@ def nearest_rows(A, b, sizes, epsilon, rows, Q, D, T, work, z):
 
 @item
 @no_type_check
-def invert(M, V):
-    """V = M^-1 by Gauss and Jordan with row exchanges; M is lost. Is M regular?"""
-    k = len(M)
-    for i in range(k):
-        for j in range(k):
-            V[i, j] = 1 if i == j else 0
-    for i in range(k):
-        pivot = i
-        for r in range(i + 1, k):
-            if abs(M[r, i]) > abs(M[pivot, i]):
-                pivot = r
-        if M[pivot, i] == 0:
-            return False
-        for j in range(k):
-            M[i, j], M[pivot, j] = M[pivot, j], M[i, j]
-            V[i, j], V[pivot, j] = V[pivot, j], V[i, j]
-        scale = 1 / M[i, i]
-        for j in range(k):
-            M[i, j] *= scale
-            V[i, j] *= scale
-        for r in range(k):
-            if r != i and M[r, i] != 0:
-                factor = M[r, i]
-                for j in range(k):
-                    M[r, j] -= factor * M[i, j]
-                    V[r, j] -= factor * V[i, j]
-    return True
-
-
-@item
-@no_type_check
 def inscribed_rows(A, b, simplex, epsilon, basis, M, V, work, able):
     """The largest ball, w = (z, r) and the rate `far` at which it grows with the simplex, and the rows that decide it.
 
@@ -288,9 +190,9 @@ def inscribed_rows(A, b, simplex, epsilon, basis, M, V, work, able):
             for j in range(m):
                 if b[j] < np.inf:
                     rate = dot(A[j], far)
-                    if rate > epsilon * reach and rate > fastest:
+                    if rate > ROUND_OFF * reach and rate > fastest:
                         q, worst, fastest = j, np.inf, rate
-                    elif fastest == 0 and rate >= -epsilon * reach:
+                    elif fastest == 0 and rate >= -ROUND_OFF * reach:
                         over = excess(A, b, j, w)
                         if over > worst:
                             q, worst = j, over

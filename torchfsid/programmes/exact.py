@@ -1,4 +1,4 @@
-r"""The two programmes on numpy arrays (B, ...), with what their derivatives need: the face of the kernels. No gradients.
+r"""The two programmes on numpy arrays (B, ...), with what their derivatives need: the face of the kernels.
 
 An item whose answer the kernel could not verify is solved once more in rational arithmetic (`rational`).
 """
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchfsid.kernels import implicit
 from torchfsid.kernels import programmes as kernel
 from torchfsid.programmes import rational
 
@@ -63,7 +64,7 @@ def inscribed_ball(A: Reals, b: Reals) -> tuple:
 def solve_active(N: Reals, filled: Mask, pull: Reals, offsets: Reals, metric: Reals | None = None) -> tuple:
     """z and mu with H z + N' mu = pull, N z = offsets, for the first rows of N, `filled`; mu = 0 for the others."""
     z, mu = np.zeros_like(pull), np.zeros_like(offsets)
-    kernel.solve_active(N, filled, pull, offsets, _or_identity(metric, N.shape[-1]), z, mu)
+    implicit.solve_active(N, filled, pull, offsets, _or_identity(metric, N.shape[-1]), z, mu)
     return z, mu
 
 
@@ -72,7 +73,7 @@ def nearest_point_vjp(
 ) -> tuple:
     """The gradients of A, b and y, from those of the nearest point (in the metric I) and of its multipliers."""
     grad_A, grad_b, grad_y = np.zeros_like(A), np.zeros(A.shape[:2]), np.zeros_like(z)
-    kernel.nearest_point_vjp(A, rows, filled, mu, z, status, grad_z, grad_mu, grad_A, grad_b, grad_y)
+    implicit.nearest_point_vjp(A, rows, filled, mu, z, status, grad_z, grad_mu, grad_A, grad_b, grad_y)
     return grad_A, grad_b, grad_y
 
 
@@ -82,7 +83,7 @@ def inscribed_ball_vjp(
     """The gradients of A and b, from those of the largest ball's centre and radius."""
     grad_A, grad_b = np.zeros_like(A), np.zeros(A.shape[:2])
     simplex = simplex_around(A.shape[2])
-    kernel.inscribed_ball_vjp(A, centre, radius, rows, simplex, grad_centre, grad_radius, grad_A, grad_b)
+    implicit.inscribed_ball_vjp(A, centre, radius, rows, simplex, grad_centre, grad_radius, grad_A, grad_b)
     return grad_A, grad_b
 
 

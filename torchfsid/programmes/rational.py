@@ -1,8 +1,9 @@
 r"""The two programmes in rational arithmetic, for the rare item whose floating-point answer could not be verified.
 
-The searches are those of `kernels.active_rows`, called as plain Python on `fractions.Fraction`: no pivot is then lost in
-round-off, and the searches are known to end. Only a row's violation is still compared with round-off, that of the numbers
-given, so that a set is EMPTY only if it is so beyond round-off. What was found is rounded, and verified like any answer.
+The searches are those of `kernels.active_rows`, called as plain Python on `fractions.Fraction`: no pivot is lost in
+round-off then, and the searches are known to end. Only the violation of a row is still compared with round-off, that of
+the given numbers: a set is EMPTY only if it is so beyond round-off. What was found is rounded, and verified like any
+answer. It takes milliseconds, a thousand times as long as the kernel.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from torchfsid.kernels import programmes as kernel
 from torchfsid.kernels.active_rows import inscribed_rows, nearest_rows
+from torchfsid.kernels.frame import cholesky, to_frame
 
 Array = NDArray[Any]
 
@@ -27,8 +29,8 @@ def nearest_point(A: Array, b: Array, y: Array, H: Array, z: Array, mu: Array, r
     """
     m, p = A.shape
     unit, offsets, sizes, lengths, L = np.empty((m, p)), np.empty(m), np.empty(m), np.empty((m, 2)), np.zeros((p, p))
-    metric = len(H) > 0 and kernel.cholesky(H[0], L)
-    kernel.to_frame(A, b, y, L, metric, unit, offsets, sizes, lengths)
+    metric = len(H) > 0 and cholesky(H[0], L)
+    to_frame(A, b, y, L, metric, unit, offsets, sizes, lengths)
     real = np.flatnonzero(offsets < np.inf)
     N, o, noise = fractions(unit[real]), fractions(offsets[real]), fractions(sizes[real])
     if not metric:  # the rows as they were given, up to powers of two
@@ -56,7 +58,7 @@ def inscribed_ball(A: Array, b: Array, simplex: Array, centre: Array, rows: Arra
     """
     (m, p), n = A.shape, A.shape[1] + 1
     unit, offsets, sizes, lengths = np.ones((m, n)), np.empty(m), np.empty(m), np.empty((m, 2))
-    kernel.to_frame(A, b, np.zeros(p), np.zeros((p, p)), False, unit[:, :p], offsets, sizes, lengths)
+    to_frame(A, b, np.zeros(p), np.zeros((p, p)), False, unit[:, :p], offsets, sizes, lengths)
     real = np.flatnonzero(offsets < np.inf)
     basis, able = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=bool)
     M, V, work = (fractions(np.zeros(shape)) for shape in ((n, n), (n, n), (5, n)))
