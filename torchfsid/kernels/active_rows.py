@@ -14,8 +14,8 @@ bounds contradict each other: the set is empty.
 
 The inscribed ball is found by the dual simplex method with lexicographic ratios. They cannot cycle, and they make the
 answer unique: of all centres, the one with the smallest z_1, among these the one with the smallest z_2, and so on. It
-starts from a simplex around everything, infinitely far away: a number is then a finite part, and a rate at which it
-grows with the distance of the simplex.
+starts from a simplex around everything, infinitely far away, whose sides are replaced by rows that face the same way: a
+number is a finite part, and a rate at which it grows with the distance of the simplex.
 
 A pivot that round-off cannot tell from zero is never taken. `epsilon` is the round-off of the arithmetic: `ROUND_OFF`
 for floating point; 0 for exact rationals, for which the same functions are called without being compiled
@@ -29,9 +29,12 @@ from typing import no_type_check
 import numpy as np
 
 from torchfsid.kernels.compiled import item
-from torchfsid.kernels.linear import dot, invert, on_rows, orthogonalise, solve_upper
+from torchfsid.kernels.linear import invert, on_rows, orthogonalise, solve_upper
 from torchfsid.outcome import ProgrammeStatus
 from torchfsid.tolerances import CLEARLY_EMPTY, MOST_ROUNDS, ROUND_OFF
+
+FACING = 0.71
+"""Cosine of the angle up to which a row can stand in for a side of the simplex that a search begins with."""
 
 OK, EMPTY, UNSOLVED = int(ProgrammeStatus.OK), int(ProgrammeStatus.EMPTY), int(ProgrammeStatus.UNSOLVED)
 
@@ -142,6 +145,22 @@ def nearest_rows(A, b, sizes, epsilon, rows, Q, D, T, work, z):
 
 @item
 @no_type_check
+def facing_rows(A, b, simplex, basis):
+    """For each side of the simplex the nearest row that faces the same way, or, if there is none, the side."""
+    m, n = A.shape
+    for s in range(n):
+        basis[s], nearest = m + s, np.inf
+        for j in range(m):
+            if b[j] < nearest:
+                cosine = 0
+                for i in range(n - 1):
+                    cosine += A[j, i] * simplex[s, i]
+                if cosine > FACING:
+                    basis[s], nearest = j, b[j]
+
+
+@item
+@no_type_check
 def inscribed_rows(A, b, simplex, epsilon, basis, M, V, work, able):
     """The largest ball, w = (z, r) and the rate `far` at which it grows with the simplex, and the rows that decide it.
 
@@ -160,9 +179,8 @@ def inscribed_rows(A, b, simplex, epsilon, basis, M, V, work, able):
     """
     m, n = A.shape
     right, share, w, far, noise = work[0], work[1], work[2], work[3], work[4]
-    for s in range(n):
-        basis[s] = m + s
-    for _ in range(MOST_ROUNDS * (m + n)):
+    facing_rows(A, b, simplex, basis)
+    for count in range(MOST_ROUNDS * (m + n)):
         is_open = False
         for s in range(n):
             row = A[basis[s]] if basis[s] < m else simplex[basis[s] - m]
@@ -170,18 +188,28 @@ def inscribed_rows(A, b, simplex, epsilon, basis, M, V, work, able):
             is_open |= basis[s] >= m
             for j in range(n):
                 M[s, j] = row[j]
-        if not invert(M, V):
+        regular, enclosed = invert(M, V), True
+        for s in range(n):
+            enclosed = enclosed and V[n - 1, s] > ROUND_OFF
+        if count == 0 and not (regular and enclosed):  # these rows hold no ball: from the simplex itself
+            for s in range(n):
+                basis[s] = m + s
+            continue
+        if not regular:
             return False
         for i in range(n):
-            w[i], far[i] = dot(V[i], right), 0
-            if is_open:
-                for s in range(n):
-                    if basis[s] >= m:
-                        far[i] += V[i, s]
+            w[i], far[i] = 0, 0
+            for s in range(n):
+                w[i] += V[i, s] * right[s]
+                if basis[s] >= m:
+                    far[i] += V[i, s]
         for s in range(n):  # one correction: the rows of a sharp corner hold to round-off then
-            share[s] = right[s] - dot(A[basis[s]] if basis[s] < m else simplex[basis[s] - m], w)
+            share[s] = right[s]
+            for i in range(n):
+                share[s] -= (A[basis[s], i] if basis[s] < m else simplex[basis[s] - m, i]) * w[i]
         for i in range(n):
-            w[i] += dot(V[i], share)
+            for s in range(n):
+                w[i] += V[i, s] * share[s]
         q, worst = -1, -np.inf
         if is_open:  # infinitely violated rows come first, infinitely slack ones never
             reach, fastest = 0, 0
@@ -189,7 +217,9 @@ def inscribed_rows(A, b, simplex, epsilon, basis, M, V, work, able):
                 reach += abs(far[i])
             for j in range(m):
                 if b[j] < np.inf:
-                    rate = dot(A[j], far)
+                    rate = 0
+                    for i in range(n):
+                        rate += A[j, i] * far[i]
                     if rate > ROUND_OFF * reach and rate > fastest:
                         q, worst, fastest = j, np.inf, rate
                     elif fastest == 0 and rate >= -ROUND_OFF * reach:

@@ -113,12 +113,15 @@ def nearest_point(A, b, y, H, z, mu, rows, filled, status):
 @item
 @no_type_check
 def has_multipliers(A, simplex, basis, V, least, N, Q, D, T, work):
-    """Is (0, .., 0, 1) a combination with weights >= 0 of those rows of the basis whose multiplier is above `least`?"""
+    """Is (0, .., 0, 1) a combination with weights >= 0 of those rows of the basis whose multiplier is above `least`?
+
+    They are solved anew: the multipliers of nearly parallel rows that do not matter have spoilt those in V.
+    """
     m, n = A.shape
     pull, offsets, left, mu, k = work[3], work[4], work[5], V[n - 1], 0
     for s in range(n):
         pull[s], offsets[s] = 1.0 if s == n - 1 else 0.0, 0.0
-        if mu[s] > least or least == 0.0:
+        if mu[s] > least:
             for j in range(n):
                 N[k, j] = A[basis[s], j] if basis[s] < m else simplex[basis[s] - m, j]
             k += 1
@@ -154,10 +157,13 @@ def finish_ball(A, b, simplex, basis, V, w, far, N, Q, D, T, work):
             largest = max(largest, abs(b[basis[i]]))
     open_radius = is_open and far[n - 1] > ROUND_OFF * reach
 
-    if not (
-        has_multipliers(A, simplex, basis, V, 0.0, N, Q, D, T, work)
-        or has_multipliers(A, simplex, basis, V, ROUND_OFF * spread, N, Q, D, T, work)
-    ):
+    balanced = True
+    for j in range(n):
+        left = -1.0 if j == n - 1 else 0.0
+        for s in range(n):
+            left += V[n - 1, s] * (A[basis[s], j] if basis[s] < m else simplex[basis[s] - m, j])
+        balanced = balanced and abs(left) <= VERIFIED and V[n - 1, j] >= -VERIFIED
+    if not (balanced or has_multipliers(A, simplex, basis, V, ROUND_OFF * spread, N, Q, D, T, work)):
         return UNSOLVED
     for j in range(m):
         if b[j] < np.inf:
