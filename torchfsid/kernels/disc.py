@@ -33,17 +33,7 @@ def _turn(rows, i, j):
 
 @item
 @no_type_check
-def _sum_of_weights(rows, i, j, k):
-    """W of three rows, or -1 if they do not span the plane in this order."""
-    first, second, third = _turn(rows, j, k), _turn(rows, k, i), _turn(rows, i, j)
-    if min(first, second, third) < 0:
-        return -1.0
-    return first + second + third
-
-
-@item
-@no_type_check
-def inscribed_in(rows, right, n, basis):
+def inscribed_in(rows, right, n, basis, weight, turned):
     """A largest disc: (x, y, r, is it one?), and the three rows that decide it into `basis`."""
     half = 1
     while half < n - 2 and _turn(rows, 0, half + 1) >= 0:
@@ -51,7 +41,7 @@ def inscribed_in(rows, right, n, basis):
     basis[0], basis[1], basis[2] = 0, half, half + 1
     x = y = r = 0.0
     for _ in range(3 * n):
-        x, y, r, scale = _touching(rows, right, basis)
+        x, y, r, scale = _touching(rows, right, basis, weight)
         worst, entering = -np.inf, 0
         for i in range(n):
             violation = rows[i, 0] * x + rows[i, 1] * y + r - right[i]
@@ -60,16 +50,16 @@ def inscribed_in(rows, right, n, basis):
         if not worst > ROUND_OFF * scale:
             # False, too, if the normals were parallel and nothing is finite.
             return x, y, r, worst <= ROUND_OFF * scale
+        for s in range(3):
+            turned[s] = _turn(rows, basis[s], entering)
         best, leaving = -1.0, -1
         for s in range(3):
-            i, j, k = basis[s], basis[(s + 1) % 3], basis[(s + 2) % 3]
-            if _turn(rows, i, entering) >= 0 and _turn(rows, entering, j) >= 0:
-                total = _sum_of_weights(rows, entering, j, k)
-                if total > best:
-                    best, leaving = total, s
-                total = _sum_of_weights(rows, i, entering, k)
-                if total > best:
-                    best, leaving = total, (s + 1) % 3
+            j, k = (s + 1) % 3, (s + 2) % 3
+            if turned[s] >= 0 and turned[j] <= 0:  # it lies between these two
+                if turned[k] >= 0 and weight[s] + turned[k] - turned[j] > best:
+                    best, leaving = weight[s] + turned[k] - turned[j], s
+                if turned[k] <= 0 and weight[j] - turned[k] + turned[s] > best:
+                    best, leaving = weight[j] - turned[k] + turned[s], j
         if leaving < 0:
             break
         basis[leaving] = entering
@@ -78,26 +68,24 @@ def inscribed_in(rows, right, n, basis):
 
 @item
 @no_type_check
-def _touching(rows, right, basis):
-    """The disc that touches three rows, and the size of the numbers in it: (x, y, r, size)."""
-    total = r = largest = 0.0
+def _touching(rows, right, basis, weight):
+    """The disc that touches three rows, and the size of the numbers in it: (x, y, r, size). Their weights."""
+    total = r = largest = scale = 0.0
     one = other = basis[0]
     for s in range(3):
         j, k = basis[(s + 1) % 3], basis[(s + 2) % 3]
-        weight = _turn(rows, j, k)
-        total += weight
-        r += weight * right[basis[s]]
-        if weight >= largest:  # the centre is where the two that turn most meet
-            largest, one, other = weight, j, k
+        weight[s] = _turn(rows, j, k)
+        total += weight[s]
+        r += weight[s] * right[basis[s]]
+        scale = max(scale, abs(right[basis[s]]))
+        if weight[s] >= largest:  # the centre is where the two that turn most meet
+            largest, one, other = weight[s], j, k
     r /= total
     # Across and along the first of them: so both hold to round-off, however little they turn.
     across, along = right[one] - r, rows[one, 0] * rows[other, 0] + rows[one, 1] * rows[other, 1]
     along = (right[other] - r - across * along) / largest
     x, y = across * rows[one, 0] - along * rows[one, 1], across * rows[one, 1] + along * rows[one, 0]
-    scale = abs(x) + abs(y) + abs(r)
-    for s in range(3):
-        scale = max(scale, abs(right[basis[s]]))
-    return x, y, r, scale
+    return x, y, r, max(scale, abs(x) + abs(y) + abs(r))
 
 
 @launcher
@@ -110,16 +98,18 @@ def inscribed(vertices, A, b, count):
     """
     B, V = b.shape
     basis, centre, radius, found = np.zeros((B, 3), np.int64), np.zeros((B, 2)), np.zeros(B), np.zeros(B, np.bool_)
-    rows, right = np.empty((V, 2)), np.empty(V)
+    rows, right, weight, turned = np.empty((V, 2)), np.empty(V), np.empty(3), np.empty(3)
     for k in range(B):
         n, x, y = count[k], 0.0, 0.0
         for i in range(n):  # about a point of the set, so that small sets far from the origin lose no digits
             x += vertices[k, i, 0] / n
             y += vertices[k, i, 1] / n
         for i in range(n):
-            norm = math.hypot(A[k, i, 0], A[k, i, 1])
+            norm = math.sqrt(A[k, i, 0] ** 2 + A[k, i, 1] ** 2)
+            if not 1e-150 < norm < 1e150:  # the squares have lost digits
+                norm = math.hypot(A[k, i, 0], A[k, i, 1])
             rows[i, 0], rows[i, 1] = A[k, i, 0] / norm, A[k, i, 1] / norm
             right[i] = (b[k, i] - A[k, i, 0] * x - A[k, i, 1] * y) / norm
-        step_x, step_y, radius[k], found[k] = inscribed_in(rows, right, n, basis[k])
+        step_x, step_y, radius[k], found[k] = inscribed_in(rows, right, n, basis[k], weight, turned)
         centre[k, 0], centre[k, 1] = x + step_x, y + step_y
     return centre, radius, basis, found

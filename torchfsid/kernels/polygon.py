@@ -28,11 +28,11 @@ NONEMPTY, UNDECIDED, EMPTY = int(Outcome.NONEMPTY), int(Outcome.UNDECIDED), int(
 
 @item_of_ordered
 @no_type_check
-def _box(vertices, n):
-    x0 = x1 = vertices[0, 0]
-    y0 = y1 = vertices[0, 1]
+def _box(vertices, k, n):
+    x0 = x1 = vertices[k, 0, 0]
+    y0 = y1 = vertices[k, 0, 1]
     for i in range(1, n):
-        x, y = vertices[i, 0], vertices[i, 1]
+        x, y = vertices[k, i, 0], vertices[k, i, 1]
         x0, x1 = x if x < x0 else x0, x if x > x1 else x1
         y0, y1 = y if y < y0 else y0, y if y > y1 else y1
     return x0, x1, y0, y1
@@ -40,27 +40,29 @@ def _box(vertices, n):
 
 @item_of_ordered
 @no_type_check
-def _beyond(vertices, n, p, q, c):
+def _beyond(vertices, k, n, p, q, c):
     """How far the vertices reach beyond the line (p, q).z = c."""
     most = -np.inf
     for i in range(n):
-        beyond = p * vertices[i, 0] + q * vertices[i, 1] - c
+        beyond = p * vertices[k, i, 0] + q * vertices[k, i, 1] - c
         most = beyond if beyond > most else most
     return most
 
 
 @item
 @no_type_check
-def mark_cuts(vertices, n, reach, A, b, tolerance, depth, cutting):
-    """Mark the rows that some vertex exceeds by more than round-off. The bounding box spares many of them the loop."""
-    x0, x1, y0, y1 = _box(vertices, n)
+def mark_cuts(vertices, k, n, reach, A, b, tolerance, depth, cutting):
+    """Mark the rows that some vertex of polygon k exceeds by more than round-off. The bounding box spares many of them
+    the loop. (Most polygons come no further: the arrays of the batch are indexed, for a view of each would cost more.)
+    """
+    x0, x1, y0, y1 = _box(vertices, k, n)
     found = False
-    for r in range(len(b)):
-        p, q, c = A[r, 0], A[r, 1], b[r]
+    for r in range(b.shape[1]):
+        p, q, c = A[k, r, 0], A[k, r, 1], b[k, r]
         cutting[r] = False
         if p * (x1 if p > 0 else x0) + q * (y1 if q > 0 else y0) - c > 0:
-            tolerance[r] = ROUND_OFF * (abs(p) * reach[0] + abs(q) * reach[1] + abs(c))
-            beyond = _beyond(vertices, n, p, q, c)
+            tolerance[r] = ROUND_OFF * (abs(p) * reach[k, 0] + abs(q) * reach[k, 1] + abs(c))
+            beyond = _beyond(vertices, k, n, p, q, c)
             cutting[r], depth[r] = beyond > tolerance[r], beyond / math.sqrt(p * p + q * q)
             found = found or cutting[r]
     return found
@@ -262,7 +264,7 @@ def clip(polygons, A, b, stamp, source, first_label, most):
     lost_time, lost_source = np.full((B, 3), np.nan), np.full((B, 3), -1)
     for k in range(B):
         n = count[k]
-        if not mark_cuts(vertices[k], n, reach[k], A[k], b[k], tolerance, depth, cutting):
+        if not mark_cuts(vertices, k, n, reach, A, b, tolerance, depth, cutting):
             continue
         for i in range(n):
             ring[i, 0], ring[i, 1], edge[i] = vertices[k, i, 0], vertices[k, i, 1], i
@@ -313,14 +315,16 @@ def _widened(polygons, slots):
     """A copy with room for `slots` vertices; new slots repeat the first vertex and carry padding rows."""
     vertices, A, b, time, source, label, count, reach = polygons
     (B, V), wide_count = b.shape, count.copy()
-    wide_vertices, wide_A, wide_b = np.empty((B, slots, 2)), np.zeros((B, slots, 2)), np.ones((B, slots))
-    wide_time, wide_source = np.full((B, slots), np.nan), np.full((B, slots), -1)
-    wide_label = np.zeros((B, slots), np.int64)
+    wide_vertices, wide_A, wide_b = np.empty((B, slots, 2)), np.empty((B, slots, 2)), np.empty((B, slots))
+    wide_time, wide_source = np.empty((B, slots)), np.empty((B, slots), np.int64)
+    wide_label = np.empty((B, slots), np.int64)
     for k in range(B):
-        for i in range(slots):
-            j = i if i < V else 0
-            wide_vertices[k, i, 0], wide_vertices[k, i, 1] = vertices[k, j, 0], vertices[k, j, 1]
         for i in range(V):
+            wide_vertices[k, i, 0], wide_vertices[k, i, 1] = vertices[k, i, 0], vertices[k, i, 1]
             wide_A[k, i, 0], wide_A[k, i, 1], wide_b[k, i] = A[k, i, 0], A[k, i, 1], b[k, i]
             wide_time[k, i], wide_source[k, i], wide_label[k, i] = time[k, i], source[k, i], label[k, i]
+        for i in range(V, slots):
+            wide_vertices[k, i, 0], wide_vertices[k, i, 1] = vertices[k, 0, 0], vertices[k, 0, 1]
+            wide_A[k, i, 0], wide_A[k, i, 1], wide_b[k, i] = 0.0, 0.0, 1.0
+            wide_time[k, i], wide_source[k, i], wide_label[k, i] = np.nan, -1, 0
     return wide_vertices, wide_A, wide_b, wide_time, wide_source, wide_label, wide_count, reach

@@ -66,6 +66,11 @@ class Body(Protocol):
     count: Int[Tensor, "B"]
 
     @property
+    def reach(self) -> Float[Tensor, "B p"]:
+        """The largest |coordinates| that the sets ever had, for round-off is inherited."""
+        ...
+
+    @property
     def vertices(self) -> Float[Tensor, "B V p"]:
         """The vertices, padded by repeating the first one."""
         ...

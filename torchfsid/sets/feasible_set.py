@@ -18,7 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import nan
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -28,7 +28,6 @@ from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, finite
 from torchfsid.outcome import Outcome
 from torchfsid.programmes.differentiable import inscribed_ball, symmetric
-from torchfsid.sets.body import Body
 from torchfsid.sets.polygon import Polygon
 from torchfsid.sets.polytope import Polytope
 from torchfsid.tolerances import ROUND_OFF
@@ -65,7 +64,7 @@ class FeasibleSet:
     """A batch of bounded convex sets of parameters. Build it with `from_box`, shrink it with `intersect`.
 
     Attributes:
-        body: the sets, batch flattened: a `Polygon` in the plane, a `Polytope` elsewhere.
+        body: the sets, batch flattened: a `Body`, in the plane a `Polygon`, elsewhere a `Polytope`.
         batch_shape: the batch.
         outcome: an `Outcome` per item; an EMPTY item contains nothing and stays empty, whatever its body.
         contradiction: for EMPTY items the rows that no parameter satisfies together.
@@ -73,7 +72,7 @@ class FeasibleSet:
         max_facets: facets kept.
     """
 
-    body: Body
+    body: Any
     batch_shape: torch.Size
     outcome: Int[Tensor, "*batch"]
     contradiction: Facets
@@ -220,7 +219,8 @@ class FeasibleSet:
         """
         self._check("theta", theta, (self.dim,), broadcast=True)
         with torch.no_grad():
-            margin = tolerance * self._batched(self.body.diameter()) + ROUND_OFF * theta.abs().amax(-1)
+            round_off = ROUND_OFF * (theta.abs().amax(-1) + 2 * self._batched(self.body.reach).sum(-1))
+            margin = tolerance * self._batched(self.body.diameter()) + round_off
             inside = self.facets().halfspaces.slack(theta) >= -margin.unsqueeze(-1)
         return inside.all(-1) & ~self.is_empty
 

@@ -165,7 +165,7 @@ class Polygon:
 
     def volume(self) -> Float[Tensor, "B"]:
         """Area, by the shoelace formula about the first corner, which keeps thin polygons exact."""
-        return self._measure()[0]
+        return self._measure()[0] if self._differentiable() else self._triangles().sum(-1)
 
     def centroid(self) -> Float[Tensor, "B 2"]:
         """Centre of area; of a polygon whose area is lost in round-off, the middle of its bounding box."""
@@ -214,7 +214,7 @@ class Polygon:
         A, b = self.rows()
         N, right = at(A, active.clamp(min=0)), at(b, active.clamp(min=0))
         along = torch.stack([-N[:, 0, 1], N[:, 0, 0]], dim=-1)
-        on_edge = (along.unsqueeze(1) @ H).squeeze(1)
+        on_edge = (H @ along.unsqueeze(-1)).squeeze(-1)
         eye = torch.eye(2, dtype=N.dtype, device=N.device)
         number = (active >= 0).sum(-1)
         M = torch.stack([N[:, 0], torch.where((number == 2).unsqueeze(-1), N[:, 1], on_edge)], dim=1)
