@@ -22,7 +22,6 @@ from torchfsid.robots.barriers import ClassK, CollisionAvoidance
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.tasks import GoalTask
-from torchfsid.sets.clipping import clip
 from torchfsid.sets.polygon import Polygon
 
 OUTSIDE = torch.tensor([[4.0, 3.5], [-3.0, 5.0]], dtype=torch.float64).repeat(100, 1)
@@ -47,7 +46,7 @@ def seed():
 def clipped_box(A: Tensor, b: Tensor) -> Polygon:
     half = torch.full((len(b), 2), 2.0, dtype=torch.float64)
     time = torch.zeros(len(b), dtype=torch.float64)
-    return clip(Polygon.from_box(-half, half), A, b, time, torch.zeros(b.shape, dtype=torch.long)).body
+    return Polygon.from_box(-half, half).clip(A, b, time, torch.zeros(b.shape, dtype=torch.long), 1000).body
 
 
 def ragged_rows() -> tuple[Tensor, Tensor]:
@@ -187,9 +186,8 @@ def test_area_as_a_function_of_positions_and_control(kind: str):
             theta = inverse_optimal_set(safe_controls, u, C, d, NoiseBound(0.05))
         half = torch.full((1, 2), 6.0, dtype=torch.float64)
         source = torch.zeros(theta.b.shape, dtype=torch.long)
-        return clip(
-            Polygon.from_box(-half, half), theta.A, theta.b, torch.zeros(1, dtype=torch.float64), source
-        ).body.volume()
+        time = torch.zeros(1, dtype=torch.float64)
+        return Polygon.from_box(-half, half).clip(theta.A, theta.b, time, source, 1000).body.volume()
 
     assert 1 < area(x, bodies, u) < 100
     assert gradcheck(area, (x, bodies, u))

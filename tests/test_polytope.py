@@ -15,7 +15,6 @@ from torch import Tensor
 
 from torchfsid.errors import SolverError
 from torchfsid.outcome import Outcome
-from torchfsid.sets import clipping
 from torchfsid.sets.body import Clipped
 from torchfsid.sets.polygon import PRIOR, Polygon
 from torchfsid.sets.polytope import Polytope, clip_polytope, merge_polytope
@@ -468,7 +467,7 @@ def test_in_the_plane_it_agrees_with_polygons() -> None:
         for _ in range(4):
             A, b = rows_around(rng, truth, 5, 2.0)
             stamp, source = torch.zeros(1, dtype=torch.float64), torch.arange(5)[None]
-            flat = clipping.clip(polygon, tensor(A)[None], tensor(b)[None], stamp, source)
+            flat = polygon.clip(tensor(A)[None], tensor(b)[None], stamp, source, 1000)
             after = cut(polytope, A, b)
             assert after.outcome == flat.outcome
             assert after.shrunk == flat.shrunk

@@ -1,0 +1,75 @@
+"""Where the gradients of a set's facets come from: the rows that were given, as long as a facet of the set is one.
+
+A search works on numbers. The rows that it has made facets, with their gradients, are kept beside it in sheets, one for
+each intersection; every facet has a label, the place of its row among all sheets, or 0 if it has no gradient. A sheet
+that no facet refers to is dropped, and with it the graph of that intersection: memory is facets.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Sheets:
+    """Rows A (N, p) and b (N,) with gradients, sheet by sheet; the first row of the first sheet has the label 1."""
+
+    sheets: tuple[tuple[Float[Tensor, "N p"], Float[Tensor, "N"]], ...] = ()
+
+    @cached_property
+    def rows(self) -> int:
+        return sum(len(b) for _, b in self.sheets)
+
+    def with_sheet(self, A: Float[Tensor, "N p"], b: Float[Tensor, "N"]) -> Sheets:
+        """One sheet more, its rows labelled on from the last one."""
+        return Sheets((*self.sheets, (A, b))) if len(b) > 0 else self
+
+    def in_use(self, label: Int[Tensor, "B F"]) -> tuple[Sheets, Int[Tensor, "B F"]]:
+        """Without the sheets that no facet is labelled by, and the labels that the facets have then.
+
+        Looked for only where there are more than twice as many rows as places for facets, so that it costs little.
+        """
+        if self.rows <= 2 * label.numel():
+            return self, label
+        used = torch.zeros(self.rows + 1, dtype=torch.bool, device=label.device)
+        used = used.index_fill(0, label.flatten(), True)[1:].split([len(b) for _, b in self.sheets])
+        kept, numbers, first = [], [label.new_zeros(1)], 1
+        for sheet, of_sheet in zip(self.sheets, used, strict=True):
+            rows = len(of_sheet)
+            stays = bool(of_sheet.any())
+            numbers.append(torch.arange(first, first + rows, device=label.device) if stays else label.new_zeros(rows))
+            if stays:
+                kept.append(sheet)
+                first += rows
+        return Sheets(tuple(kept)), torch.cat(numbers)[label]
+
+    def joined(self, other: Sheets, label: Int[Tensor, "B F"]) -> tuple[Sheets, Int[Tensor, "B F"]]:
+        """These sheets and those of `other`, and what its labels are then. A sheet of both is kept once."""
+        new = [sheet for sheet in other.sheets if not any(sheet is mine for mine in self.sheets)]
+        sheets, first, next_label = (*self.sheets, *new), {}, 1
+        for sheet in sheets:
+            first[id(sheet)] = next_label
+            next_label += len(sheet[1])
+        numbers = [
+            torch.arange(first[id(sheet)], first[id(sheet)] + len(sheet[1]), device=label.device)
+            for sheet in other.sheets
+        ]
+        return Sheets(sheets), torch.cat([label.new_zeros(1), *numbers])[label]
+
+    def attached(
+        self, A: Float[Tensor, "B F p"], b: Float[Tensor, "B F"], label: Int[Tensor, "B F"]
+    ) -> tuple[Float[Tensor, "B F p"], Float[Tensor, "B F"]]:
+        """The facets' rows, numbers without gradients, with the gradients of the rows that they are labelled by."""
+        if not self.sheets:
+            return A, b
+        # Zero, with a gradient: a facet that was moved outward keeps its place.
+        zeros = [(rows - rows.detach(), right - right.detach()) for rows, right in self.sheets]
+        of_A = torch.cat([A.new_zeros(1, A.shape[-1]), *(rows for rows, _ in zeros)])
+        of_b = torch.cat([b.new_zeros(1), *(right for _, right in zeros)])
+        index = label.flatten()
+        return A + of_A.index_select(0, index).reshape(A.shape), b + of_b.index_select(0, index).reshape(b.shape)
