@@ -18,7 +18,7 @@ from torchfsid.outcome import Outcome
 from torchfsid.sets import clipping
 from torchfsid.sets.body import Clipped
 from torchfsid.sets.polygon import PRIOR, Polygon
-from torchfsid.sets.polytope import Polytope, clip_polytope, merge_polytope
+from torchfsid.sets.polytope import Polytope
 
 BOX = 10.0
 """Half the side of the boxes that the sets begin with: the size their round-off is measured against."""
@@ -39,7 +39,7 @@ def cut(polytope: Polytope, A: np.ndarray, b: np.ndarray, time: float = 0.0) -> 
     B = len(polytope.count)
     rows, right = tensor(A).expand(B, *A.shape[-2:]), tensor(b).expand(B, b.shape[-1])
     stamp = torch.full((B,), time, dtype=torch.float64)
-    return clip_polytope(polytope, rows, right, stamp, torch.arange(b.shape[-1]).expand(right.shape))
+    return polytope.clip(rows, right, stamp, torch.arange(b.shape[-1]).expand(right.shape), 1000)
 
 
 def rows_of(polytope: Polytope, item: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -509,7 +509,7 @@ def test_merging_drops_the_facet_that_keeps_out_least_and_stays_outside(p: int, 
     for _ in range(3):
         body, _, _ = random_set(rng, p, rows=25, width=width)
         (A, b), count = rows_of(body), int(body.count)
-        merged = merge_polytope(body, count - 1)
+        merged = body.merge(count - 1)
         ways = [np.arange(count) != facet for facet in range(count)]
         least = min(volume_by_qhull(A[way], b[way], body) for way in ways)
         if least > 100 * body.volume().item():  # a slab that one more facet less would all but open
@@ -518,7 +518,7 @@ def test_merging_drops_the_facet_that_keeps_out_least_and_stays_outside(p: int, 
         assert int(merged.count) == count - 1
         assert merged.volume().item() == pytest.approx(least, rel=1e-6)
 
-        merged = merge_polytope(body, count - 2)
+        merged = body.merge(count - 2)
         rows, right = rows_of(merged)
         assert len(right) <= count - 1
         assert (points_of(body) @ rows.T <= right + 1e-14 * BOX * np.abs(rows).sum(1)).all()
@@ -533,11 +533,11 @@ def test_merging_drops_the_facet_that_keeps_out_least_and_stays_outside(p: int, 
 
 def test_merging_drops_first_what_keeps_out_least_and_never_opens_the_set() -> None:
     block = box(3, half=1.0)
-    assert int(merge_polytope(block, 4).count) == 6
+    assert int(block.merge(4).count) == 6
     corners = np.array([[1.0, 1, 1], [-1.0, 1, 1], [1.0, -1, 1]])
     chamfered = cut(block, corners, np.array([2.9, 2.5, 2.7])).body  # each cuts off a corner of edge e, e^3 / 6
     for most, kept in [(8, {1, 2}), (7, {1}), (6, set())]:
-        merged = merge_polytope(chamfered, most)
+        merged = chamfered.merge(most)
         assert set(merged.source[0].tolist()) == kept | {PRIOR}
         assert merged.volume().item() == pytest.approx(8 - sum({1: 0.5**3, 2: 0.3**3}[i] / 6 for i in kept), rel=1e-12)
 
