@@ -71,7 +71,8 @@ class Cell:
     @property
     def content(self) -> float:
         """The volume; of a flat cell, a multiple of round-off."""
-        batch = Shape(*(field[None] for field in (self.A, self.b, self.vertices, self.incident, self.reach)))
+        count = np.array(len(self.vertices))
+        batch = Shape(*(field[None] for field in (self.A, self.b, self.vertices, count, self.incident, self.reach)))
         return float(batch.content[0])
 
     def round_off(self, A: Reals, b: Reals) -> Reals:

@@ -175,7 +175,8 @@ class Polytope:
     @cached_property
     def shape(self) -> Shape:
         """Without gradients, in numpy."""
-        return Shape(*(array(field) for field in (self.A, self.b, self.corners, self.incident, self.reach)))
+        fields = (self.A, self.b, self.corners, self.vertex_count, self.incident, self.reach)
+        return Shape(*(array(field) for field in fields))
 
     @cached_property
     def _cells(self) -> list[Cell]:
@@ -203,7 +204,7 @@ class Polytope:
     @property
     def _middle(self) -> Float[Tensor, "B p"]:
         """A point of the set, without gradients."""
-        return self._as_tensor(self.shape.frame.middle)
+        return self._as_tensor(self.shape.middle)
 
     @property
     def _recentred(self) -> Halfspaces:

@@ -35,7 +35,8 @@ def vertices(
     """The corners as functions of the rows; one that is not the solution of p facets does not depend on them."""
     frame, unit = _Frame.of(shape, A), Halfspaces(A, b).normalised()
     step = _step(*frame.rows(unit.A, unit.b), torch.as_tensor(shape.y, device=A.device), shape.bases)
-    return corners + frame.outside(step)
+    moved, real = corners + frame.outside(step), torch.as_tensor(shape.incident.any(2), device=A.device)
+    return torch.where(real.unsqueeze(-1), moved, moved[:, :1])
 
 
 def measure(

@@ -34,11 +34,9 @@ class Frame(NamedTuple):
 
     @classmethod
     def of(cls, vertices: Reals, real: Mask, reach: Reals) -> Frame:
-        """Of vertices (B, V, p), V >= p, those that are `real` (B, V)."""
+        """Of vertices (B, V, p), V >= p, those that are `real` (B, V); the others repeat the first one."""
         count, largest = real.sum(1)[:, None], reach.max(1, keepdims=True)
-        # About a vertex: of a thin set far from the origin, a mean of coordinates would leave the set.
-        first = vertices[np.arange(len(real)), real.argmax(1)]
-        middle = first + np.where(real[..., None], vertices - first[:, None], 0.0).sum(1) / count
+        middle = mean(vertices, count)
         _, scale, axes = np.linalg.svd(np.where(real[..., None], vertices - middle[:, None], 0.0), full_matrices=False)
         scale = scale / np.sqrt(count)
         return cls(middle, axes, np.maximum(scale, ROUND_OFF / 8 * largest), scale <= FLAT * largest)
@@ -72,20 +70,28 @@ class Shape:
 
     Attributes:
         A, b: rows (B, F, p), (B, F).
-        vertices: (B, V, p), V >= p; padding is on no facet.
-        incident: (B, V, F), which vertex is on which facet.
+        vertices: (B, V, p), V >= p, padded by repeating the first one.
+        count: (B,), how many vertices are real.
+        incident: (B, V, F), which vertex is on which facet; padding is on none.
         reach: (B, p), the largest |coordinates| that the set ever had.
     """
 
     A: Reals
     b: Reals
     vertices: Reals
+    count: Indices
     incident: Mask
     reach: Reals
 
     @cached_property
+    def middle(self) -> Reals:
+        """The mean of the vertices, a point of the set."""
+        return mean(self.vertices, self.count[:, None])
+
+    @cached_property
     def frame(self) -> Frame:
-        return Frame.of(self.vertices, self.incident.any(2), self.reach)
+        real = np.arange(self.vertices.shape[1]) < self.count[:, None]
+        return Frame.of(self.vertices, real, self.reach)
 
     @cached_property
     def is_flat(self) -> Mask:
@@ -155,6 +161,13 @@ class Shape:
     def simplices(self) -> tuple[Indices, Indices]:
         """The facets of `solid`, taken apart (see `faces.simplices`); a flat set has none."""
         return simplices(self.solid.incident & ~self.is_flat[:, None, None], self.A.shape[2])
+
+
+def mean(vertices: Reals, count: Indices) -> Reals:
+    """The mean of the vertices (B, V, p), of which `count` (B, 1) are real and the others repeat the first one."""
+    # About the first one: the mean of the coordinates of a thin set far from the origin may be outside.
+    first = vertices[:, 0]
+    return first + (vertices - first[:, None]).sum(1) / count
 
 
 def unit_rows(A: Reals, b: Reals) -> tuple[Reals, Reals]:
