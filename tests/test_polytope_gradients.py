@@ -18,7 +18,6 @@ from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.simulation import simulate
 from torchfsid.robots.tasks import UnknownGainGoalTask
-from torchfsid.sets import clipping
 from torchfsid.sets.feasible_set import FeasibleSet
 from torchfsid.sets.polygon import Polygon
 from torchfsid.sets.polytope import Polytope
@@ -189,7 +188,7 @@ def test_in_the_plane_polygons_have_the_same_derivatives() -> None:
     b = (A.detach().norm(dim=-1) * torch.linspace(0.6, 1.6, 8, dtype=torch.float64)).requires_grad_()
     points, factors = 3 * torch.ones(3, 2, dtype=torch.float64), torch.randn(3, 2, 2, generator=generator).double()
     time, source = torch.zeros(3, dtype=torch.float64), torch.zeros(3, 8, dtype=torch.long)
-    polygon = clipping.clip(Polygon.from_box(*corners(2, 2.0, 3)), A, b, time, source).body
+    polygon = Polygon.from_box(*corners(2, 2.0, 3)).clip(A, b, time, source, 1000).body
     weights = torch.randn(3, 2, generator=generator).double()
     derivatives = []
     for body in (clipped(A, b), polygon):

@@ -231,7 +231,8 @@ def _nearby(cell: Cell, A: Reals, b: Reals, reach: float) -> Intersection:
     """{z : A z <= b} in a box around a cell, `reach` times as large; from it come the facets of origin len(A) on."""
     frame = cell.frame
     middle, axes = frame.middle[0], frame.axes[0]
-    half = np.maximum(np.abs((cell.vertices - middle) @ axes.T).max(0), frame.scale[0]) * reach
+    # Its sides are beyond those of the cell by more than their round-off, or the rows would not cut it.
+    half = np.abs((cell.vertices - middle) @ axes.T).max(0) * reach + 16 * ROUND_OFF * cell.reach.sum()
     own = Cell.box(-half, half)
     vertices = middle + own.vertices @ axes
     reach = np.maximum(cell.reach, np.abs(vertices).max(0))

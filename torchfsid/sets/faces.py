@@ -5,8 +5,8 @@ a face is filled by the pyramids over the sides that the apex is not on, and so 
 
     vol_k(F) = sum over the sides S of F of dist(apex, S) vol_{k-1}(S) / k.
 
-Taken apart all the way, a facet is a set of simplices (Cohen and Hickey, J. ACM 26, 1979). Vertices that are on no facet
-are padding. Vertices are numbered through the batch, vertex v of item i being i V + v; likewise facets.
+Taken apart all the way, a facet is a set of simplices (Cohen and Hickey, J. ACM 26, 1979). Vertices that are on no
+facet are padding. Vertices are numbered through the batch, vertex v of item i being i V + v; likewise facets.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Level(NamedTuple):
 
 def pyramids(y: Reals, incident: Mask) -> tuple[Reals, Reals, Reals]:
     """Volumes (B,), centroids (B, p) and the areas of the facets (B, F) of polytopes with vertices y (B, V, p)."""
-    (B, V, F), p = incident.shape, y.shape[2]
+    (B, _, F), p = incident.shape, y.shape[2]
     volumes, centroids, areas = np.zeros(B), np.zeros((B, p)), np.zeros((B, F))
     for some in _parts(incident, p):
         volumes[some], centroids[some], areas[some] = _pyramids(y[some], incident[some])
@@ -116,7 +116,8 @@ def bases(rows: Reals, incident: Mask) -> tuple[Indices, Mask]:
         chosen[..., k] = lengths.argmax(-1)
         length = np.take_along_axis(lengths, chosen[..., k, None], axis=-1)
         enough &= length[..., 0] > PARALLEL_ROWS
-        along = np.take_along_axis(left, chosen[..., k, None, None], axis=-2) / np.where(length > 0, length, 1.0)[..., None]
+        along = np.take_along_axis(left, chosen[..., k, None, None], axis=-2)
+        along = along / np.where(length > 0, length, 1.0)[..., None]
         left -= (left @ along.swapaxes(-1, -2)) * along
     return chosen, enough
 

@@ -1,9 +1,9 @@
 r"""Batched convex polytopes: the sets of parameters beyond the plane (p = 1, 3, 4, ...), and what is asked of them.
 
-The counterpart of `polygon`, behind the same interface. What has to be found is found in numpy, without gradients: which
-facets are left after a clip in `cell`, volume and centroid in `shape`, the nearest point and the inscribed ball in
-`programmes`. Every facet is one of the rows that were given, and carries its gradient; what follows from the facets is
-differentiable in them, twice. Whatever round-off leaves open stays in: every set is an outer set.
+The counterpart of `polygon`, behind the same interface. What has to be found is found in numpy, without gradients:
+which facets are left after a clip in `cell`, volume and centroid in `shape`, the nearest point and the inscribed ball
+in `programmes`. Every facet is one of the rows that were given, and carries its gradient. What follows from the facets
+is differentiable in them, twice. Whatever round-off leaves open stays in: every set is an outer set.
 """
 
 from __future__ import annotations
@@ -154,12 +154,12 @@ class Polytope:
 
         Where the centre is not unique, the one with the smallest z_1 is returned, among these the one with the smallest
         z_2, and so on, with the gradient of the p + 1 facets that decide it so. The radius and its gradient are right
-        in any case. A set without interior has the radius 0, around a point of it.
+        in any case. A flat set has the radius 0, up to round-off, around a point of it.
         """
         ball = inscribed_ball(self._recentred)
-        found = (ball.status == ProgrammeStatus.OK) & (ball.radius > 0)
-        centre = self._middle + torch.where(found.unsqueeze(-1), ball.centre, 0.0)
-        return centre, torch.where(found, ball.radius, 0.0)
+        flat = (ball.status == ProgrammeStatus.DEGENERATE) | (ball.status == ProgrammeStatus.EMPTY)
+        centre = self._middle + torch.where(flat.unsqueeze(-1), 0.0, ball.centre)
+        return centre, torch.where(flat, 0.0, ball.radius)
 
     def nearest(
         self, point: Float[Tensor, "B p"], metric: Float[Tensor, "B p p"] | None = None

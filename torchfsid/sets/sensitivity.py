@@ -1,5 +1,6 @@
-r"""How vertices, volume and centroid of polytopes change with their rows A z <= b: numbers from `shape`, derivatives here.
+r"""How vertices, volume and centroid of polytopes change with their rows A z <= b.
 
+The numbers come from `shape`, the derivatives from here.
 Which facets meet in a vertex and fill the boundary is known from there. A vertex is the solution of p of its facets,
 
     A_I z = b_I.

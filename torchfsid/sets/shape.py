@@ -1,4 +1,4 @@
-r"""The shape of polytopes, a batch at a time, in numpy: principal axes, volume, centroid, and what their derivatives need.
+r"""The shape of polytopes, a batch at a time, in numpy: principal axes, volume, centroid, vertices' bases, simplices.
 
 It is computed in the frame of each set, z = middle + (y * scale) axes, the principal axes of its vertices, in which it
 is about as wide in every direction, however thin it is.
@@ -52,7 +52,8 @@ class Frame(NamedTuple):
     def rows(self, A: Reals, b: Reals) -> tuple[Reals, Reals]:
         """Rows A z <= b as rows of y, of length 1; padding keeps its A = 0."""
         unit, right = unit_rows(A, b)
-        return unit_rows(unit @ (self.axes.swapaxes(1, 2) * self.scale[:, None]), right - (unit @ self.middle[..., None])[..., 0])
+        right = right - (unit @ self.middle[..., None])[..., 0]
+        return unit_rows(unit @ (self.axes.swapaxes(1, 2) * self.scale[:, None]), right)
 
 
 class Solid(NamedTuple):
