@@ -3,6 +3,7 @@ the order of the rows does not matter, a smaller bound never gives a larger set,
 """
 
 import itertools
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -131,6 +132,42 @@ def test_a_row_that_only_touches_leaves_a_sliver(p: int) -> None:
         assert less.outcome == Outcome.NONEMPTY
         assert touched.body.support(tensor(A)[None]).amax() <= less.body.support(tensor(A)[None]).amax() + NOISE
         assert not cut(block, -row[None], np.array([float(k)])).shrunk
+
+
+def least_float_above(row: np.ndarray, point: np.ndarray) -> float:
+    """The least float b with row.point <= b, in rational arithmetic."""
+    value = sum(Fraction(a) * Fraction(z) for a, z in zip(row.tolist(), point.tolist(), strict=True))
+    b = float(value)
+    while Fraction(b) < value:
+        b = float(np.nextafter(b, np.inf))
+    return b
+
+
+@pytest.mark.parametrize("half", [1e-1, 1e-3, 1e-5, 1e-8, 1e-10, 1e-12])
+@pytest.mark.parametrize("p", [1, 3, 4])
+def test_a_truth_at_the_apex_of_a_sharp_cone_is_never_lost(p: int, half: float) -> None:
+    """The cone, a row across it, then rows of all directions, each through the truth: a row that touches too far from
+    the corner that was computed leaves a sliver around it, and half-spaces that still hold the truth."""
+    cones = []
+    for seed in range(30):
+        rng = np.random.default_rng([p, seed])
+        truth, Q = rng.uniform(-1, 1, p) + rng.choice([0, 1e3, 1e6]), np.linalg.qr(rng.normal(size=(p, p)))[0]
+        axis, sides = Q[0], np.vstack([Q[1:], -Q[1:]]) * np.cos(half) + Q[0] * np.sin(half)
+        across = -axis + half * rng.uniform(-1, 1, (2, p))
+        A = np.vstack([sides, across, rng.normal(size=(3, p)), -sides[:1]])
+        cones.append((truth, A, [least_float_above(row, truth) for row in A]))
+    truth, A, b = (tensor(np.stack(part)) for part in zip(*cones, strict=True))
+    theta, turns = FeasibleSet.from_box(truth.round() - 2, truth.round() + 2), b.shape[-1] - 5
+    for rows in (slice(0, turns), *(slice(k, k + 1) for k in range(turns, b.shape[-1]))):
+        theta = theta.intersect(Halfspaces(A[:, rows], b[:, rows]))
+        assert (theta.outcome != Outcome.EMPTY).all()
+        assert theta.contains(truth).all()
+        for answer in (*theta.chebyshev(), theta.centroid(), theta.project(truth + 5), theta.volume()):
+            assert answer.isfinite().all()
+    facets = theta.facets().halfspaces
+    for point, rows, right in zip(truth.tolist(), facets.A.tolist(), facets.b.tolist(), strict=True):
+        for row, c in zip(rows, right, strict=True):
+            assert sum(Fraction(a) * Fraction(z) for a, z in zip(row, point, strict=True)) <= Fraction(c)
 
 
 @pytest.mark.parametrize("p", [3, 4])

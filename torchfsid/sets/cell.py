@@ -32,8 +32,7 @@ from torchfsid.sets.shape import Frame, Shape, lengths
 from torchfsid.tolerances import ROUND_OFF
 
 REACH = 100.0
-"""What happens beyond this many times the size of a set is out of its sight: a set that grows further without a facet
-is taken to be unbounded without it, and rows that only meet further away contradict each other."""
+"""A set that grows to more than this many times its size without a facet is taken to be unbounded without it."""
 
 NOTHING = np.zeros(0, dtype=np.int64)
 
@@ -176,13 +175,15 @@ def _contradiction(cell: Cell, row: _Row, origin: Indices) -> Indices:
     """
     at, frame = np.flatnonzero(cell.incident[row.over.argmin()]), cell.frame
     A, b = np.vstack([row.a, cell.A[at]]), np.append(row.c, cell.b[at])
-    noise, norms = cell.round_off(A, b), lengths(A @ (frame.axes[0].T * frame.scale[0]))
-    rows, right = A @ (frame.axes[0].T * frame.scale[0]) / norms[:, None], (b - A @ frame.middle[0]) / norms
+    rows = A @ (frame.axes[0].T * frame.scale[0])
+    norms = lengths(rows)
     try:
-        y = np.append(1.0, nnls(rows[1:].T, -rows[0])[0])
+        y, _ = nnls((rows[1:] / norms[1:, None]).T, -rows[0] / norms[0])
     except RuntimeError:  # it stalled: undecided
         return NOTHING
-    if y @ right >= -(y @ (noise / norms) + REACH * np.linalg.norm(y @ rows)):
+    y = np.append(1.0, y) / norms
+    # For points z that satisfy the rows, and |z| <= reach as for all points of the set, y'b >= y'A z >= -|y'A| reach.
+    if y @ b >= -(y @ cell.round_off(A, b) + np.abs(y @ A) @ cell.reach):
         return NOTHING
     return np.append(origin[-1], origin[at])[y > 0]
 

@@ -168,7 +168,13 @@ class Polytope:
 
         NaN where `point` or `metric` is not finite, or `metric` not positive definite.
         """
-        return self._middle + nearest_point(self._recentred, point - self._middle, metric).point
+        rows, point = self._recentred, point - self._middle
+        found = nearest_point(rows, point, metric)
+        lost = found.status == ProgrammeStatus.EMPTY
+        if bool(lost.any()):  # by the round-off of the middle, that of a flat set
+            wider = rows.b + torch.where(lost.unsqueeze(-1), 2 * self._round_off, 0.0)
+            found = nearest_point(Halfspaces(rows.A, wider), point, metric)
+        return self._middle + found.point
 
     # How it is kept -------------------------------------------------------------------------------------------------
 
@@ -210,6 +216,11 @@ class Polytope:
     def _recentred(self) -> Halfspaces:
         """The set with its middle moved to the origin, so that round-off is that of its size."""
         return Halfspaces(self.A, self.b - times(self.A, self._middle))
+
+    @property
+    def _round_off(self) -> Float[Tensor, "B F"]:
+        """Round-off of A z - b over the set."""
+        return (ROUND_OFF * (times(self.A.abs(), self.reach) + self.b.abs())).detach()
 
     def _as_tensor(self, field: Reals) -> Tensor:
         return torch.as_tensor(field, device=self.A.device)
