@@ -10,7 +10,7 @@ makes the observer call out a violated row beats all others.
 from __future__ import annotations
 
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from experiments.config import SceneConfig
-from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.identification.evidence import ObservationModel, evidence
 from torchfsid.robots.barriers import Barrier, stack_barriers
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.simulation import Trajectory
@@ -52,9 +52,8 @@ def _worst(true: Trajectory, config: SceneConfig, random: np.random.Generator) -
     lower, upper = (
         torch.tensor(corner).expand(candidates.shape) for corner in (config.prior.lower, config.prior.upper)
     )
-    observer = SetMembershipObserver(
-        config.task.build(config.bodies), barriers, FeasibleSet.from_box(lower, upper), noise=config.noise.build()
-    )
+    model = ObservationModel(config.task.build(config.bodies), barriers, noise=config.noise.build())
+    prior = FeasibleSet.from_box(lower, upper)
     x, u = true.x.clone(), true.u.clone()
     x[0, :robots] += _on_circle(random, noise.position, (robots,))
     u[0, :robots] += _on_circle(random, noise.velocity, (robots,))
@@ -71,27 +70,17 @@ def _worst(true: Trajectory, config: SceneConfig, random: np.random.Generator) -
         normal = rows.A[torch.arange(robots), nearest]
         angles = torch.atan2(normal[:, 1], normal[:, 0]) + turns.T.unsqueeze(-1)  # (position or velocity, turn, robot)
         x_moves, u_moves = noise.position * _towards(angles[0]), noise.velocity * _towards(angles[1])
-        reading = observer.read(
-            replace(
-                _repeated(seen, len(turns)),
-                x=(exact.x + x_moves).flatten(0, 1),
-                u=(exact.u + u_moves).flatten(0, 1),
-            )
+        tried = replace(
+            seen.select(torch.arange(robots).repeat(len(turns))),
+            x=(exact.x + x_moves).flatten(0, 1),
+            u=(exact.u + u_moves).flatten(0, 1),
         )
-        room = reading.omega.slack(candidates).amin(-1).masked_fill(reading.alarmed, -math.inf)
+        found = evidence(model, prior, tried)
+        room = found.omega.slack(candidates).amin(-1).masked_fill(found.alarmed, -math.inf)
         worst = room.reshape(len(turns), robots).argmin(0)
         x[k, :robots] = exact.x + x_moves[worst, torch.arange(robots)]
         u[k, :robots] = exact.u + u_moves[worst, torch.arange(robots)]
     return replace(true, x=x, u=u)
-
-
-def _repeated(measurement: Measurement, times: int) -> Measurement:
-    """The batch several times over."""
-    columns = {field.name: getattr(measurement, field.name) for field in fields(Measurement)}
-    return replace(
-        measurement,
-        **{name: torch.cat([column] * times) for name, column in columns.items() if isinstance(column, Tensor)},
-    )
 
 
 def in_disc(random: np.random.Generator, radius: float, shape: tuple[int, ...]) -> Float[Tensor, "*shape 2"]:

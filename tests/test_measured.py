@@ -15,7 +15,7 @@ from experiments.config import SceneConfig
 from experiments.recording import Scene, simulate_scene
 from experiments.sweep_config import load_sweep
 from experiments.teams import TeamConfig
-from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.identification.evidence import ObservationModel, evidence
 from torchfsid.sets.feasible_set import FeasibleSet
 
 MONTE_CARLO = Path(__file__).parents[1] / "configs" / "monte_carlo.yaml"
@@ -68,8 +68,9 @@ def room(measured: Scene) -> torch.Tensor:
     """Distance of each true goal to the nearest half-space of each sample, where there is one [m]."""
     recording = measured.recording()
     prior = FeasibleSet.from_box(recording.goals - 9.0, recording.goals + 9.0)
-    observer = SetMembershipObserver(recording.task, recording.barriers, prior, noise=measured.config.noise.build())
-    rows = torch.stack([observer.read(seen).omega.slack(recording.goals).amin(-1) for seen in recording.measurements])
+    model = ObservationModel(recording.task, recording.barriers, noise=measured.config.noise.build())
+    said = [evidence(model, prior, seen).omega for seen in recording.measurements]
+    rows = torch.stack([omega.slack(recording.goals).amin(-1) for omega in said])
     return rows[rows < 0.99]  # padding has a slack of 1
 
 
