@@ -14,9 +14,9 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 
 import torch
 from torch import Tensor
@@ -51,9 +51,10 @@ class ResultsWriter:
         out: Path,
         robots: Sequence[str],
         observer: SetMembershipObserver,
-        others: dict[str, SetMembershipObserver] | None = None,
+        others: Mapping[str, SetMembershipObserver] = MappingProxyType({}),
     ):
-        self.out, self.robots, self.observer, self.others = out, list(robots), observer, others or {}
+        self.out, self.robots, self.observer, self.others = out, list(robots), observer, others
+        self._described = {name: _Descriptions() for name in ("", *others)}
         self._problem: OSError | None = None
 
     def __enter__(self) -> ResultsWriter:
@@ -81,7 +82,7 @@ class ResultsWriter:
         self,
         measurement: Measurement,
         estimate: HybridEstimate | SetEstimate,
-        others: dict[str, SetEstimate] | None = None,
+        others: Mapping[str, SetEstimate] = MappingProxyType({}),
     ) -> None:
         """One row per robot for the instant of `estimate`."""
         if self._problem is not None:
@@ -93,8 +94,8 @@ class ResultsWriter:
         observed = measurement.observed
         measured = [True] * len(self.robots) if observed is None else observed.tolist()
         case, n_active, status = sets.kkt.case.tolist(), sets.kkt.n_active.tolist(), sets.status.tolist()
-        described, t = describe(sets.feasible_set), _number(float(estimate.t))
-        extra = [(describe(other.feasible_set), other.status.tolist()) for other in (others or {}).values()]
+        described, t = self._described[""](sets.feasible_set), _number(float(estimate.t))
+        extra = [(self._described[name](other.feasible_set), other.status.tolist()) for name, other in others.items()]
         rows = []
         for i, robot in enumerate(self.robots):
             active = [CASES[case[i]], str(n_active[i])] if measured[i] else ["", ""]
@@ -135,6 +136,24 @@ def describe(sets: FeasibleSet) -> list[list[str]]:
     centre, radius = sets.chebyshev()
     columns = [sets.volume()[:, None], sets.diameter()[:, None], centre, radius[:, None], sets.centroid()]
     return _texts(torch.cat(columns, dim=-1))
+
+
+class _Descriptions:
+    """`describe` sample after sample: only the sets that have changed are measured again."""
+
+    def __init__(self) -> None:
+        self._texts: list[list[str]] = []
+        self._last_cut = torch.empty(0)
+
+    def __call__(self, sets: FeasibleSet) -> list[list[str]]:
+        last_cut = sets.last_cut.nan_to_num(nan=-math.inf)  # a set that starts again is the prior: never cut
+        if not self._texts:
+            self._texts = describe(sets)
+        elif len(changed := (last_cut != self._last_cut).nonzero().flatten()):
+            for i, texts in zip(changed.tolist(), describe(sets.select(changed)), strict=True):
+                self._texts[i] = texts
+        self._last_cut = last_cut
+        return self._texts
 
 
 def constraint_name(source: int, labels: Sequence[str]) -> str:

@@ -130,12 +130,12 @@ class ResultsFolder:
                 path.parent.rmdir()
 
 
-def write_whole(path: Path, text: str) -> None:
+def write_whole(path: Path, content: str | bytes) -> None:
     """Write a file whole or not at all."""
     partial = path.with_name(path.name + ".partial")
     try:
         with named(path):
-            partial.write_text(text, encoding="utf-8")
+            partial.write_bytes(content.encode() if isinstance(content, str) else content)
             partial.replace(path)
     except BaseException:
         partial.unlink(missing_ok=True)
