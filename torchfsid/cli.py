@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torchfsid.commands.command_line import Parser, add_overrides, execute
+from torchfsid.commands.interruption import importing
 from torchfsid.commands.results_folder import OBSERVE, ResultsFolder
 
 
@@ -39,23 +40,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _observe(log: Path, config: Path, folder: ResultsFolder, overrides: Sequence[str]) -> None:
-    from torchfsid.config.models import load_models
+    with importing():
+        from torchfsid.config.models import load_models
 
     folder.require_ours()
     models = load_models(config, overrides)
 
-    from torchfsid.commands.on_logs import observe_log
+    with importing():
+        from torchfsid.commands.on_logs import observe_log
 
     observe_log(log, models, folder)
 
 
 def _check(log: Path, config: Path, folder: ResultsFolder | None, overrides: Sequence[str]) -> None:
-    from torchfsid.config.models import load_models
+    with importing():
+        from torchfsid.config.models import load_models
 
     if folder is not None:
         folder.require_ours()
     models = load_models(config, overrides)
 
-    from torchfsid.commands.on_logs import check_log
+    with importing():
+        from torchfsid.commands.on_logs import check_log
 
     check_log(log, models, folder)

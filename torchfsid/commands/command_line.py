@@ -49,29 +49,33 @@ def execute(
 
     Args:
         program: the name in front of that line.
-        action: the command. It imports what it needs, so that mistakes are found before slow imports.
+        action: the command. It imports what it needs itself (`interruption.importing`), slow modules last.
         folder: where it writes; given back at the end.
         left: what to say of an interrupted command that had begun to write.
     """
+
+    def has_begun() -> bool:
+        return folder is not None and folder.claimed
+
     code, message = DONE, ""
     # The message is printed below the `except` clauses, when the frames of the exception are gone and with them a
     # progress line.
     try:
-        with interruptible():
+        with interruptible(program):
             action()
             _flush()
     except FsidError as error:
-        code, message = FAILURE if folder is not None and folder.claimed else USAGE_ERROR, str(error)
+        code, message = FAILURE if has_begun() else USAGE_ERROR, str(error)
     except OSError as error:
-        code = FAILURE if folder is None or folder.claimed or error.filename is None else USAGE_ERROR
+        code = FAILURE if has_begun() or error.filename is None else USAGE_ERROR
         message = f"{error.filename or 'standard output'}: {error.strerror or one_line(error)}"
     except MemoryError:
         code, message = FAILURE, "not enough memory"
     except KeyboardInterrupt as stop:
         number = stop.number if isinstance(stop, Interrupted) else int(signal.SIGINT)
         code, message = 128 + number, str(Interrupted(number))
-        if folder is not None and folder.claimed:
-            message += "; " + left.format(folder=folder.path)
+        if folder is not None and has_begun():
+            message += f"; {left.format(folder=folder.path)}"
     finally:
         if folder is not None:
             folder.release()

@@ -7,10 +7,12 @@ ones are ignored, so that nobody who asks twice gets less.
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import threading
 from collections.abc import Iterator
 from types import FrameType
+from typing import Literal
 
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
@@ -26,15 +28,15 @@ class Interrupted(KeyboardInterrupt):
         return "interrupted" if self.number == signal.SIGINT else f"stopped by {signal.Signals(self.number).name}"
 
 
-class _Pending:
-    """Signals come to the process: so this is of the process too."""
+class _Now:
+    """What a signal does now, and which one waits. Signals come to the process: so this is of the process too."""
 
-    held = False
-    number: int | None = None
+    does: Literal["raise", "wait", "exit"] = "raise"
+    waiting: int | None = None
 
 
 @contextlib.contextmanager
-def interruptible() -> Iterator[None]:
+def interruptible(program: str) -> Iterator[None]:
     """Signals raise `Interrupted` in here. Those that the process was started to ignore (`nohup`) stay ignored."""
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -45,9 +47,12 @@ def interruptible() -> Iterator[None]:
     def interrupt(number: int, frame: FrameType | None) -> None:
         for other in heard:
             signal.signal(other, signal.SIG_IGN)
-        if not _Pending.held:
+        if _Now.does == "exit":
+            os.write(2, f"{program}: {Interrupted(number)}\n".encode())
+            os._exit(128 + number)
+        if _Now.does == "raise":
             raise Interrupted(number)
-        _Pending.number = number
+        _Now.waiting = number
 
     for number in heard:
         signal.signal(number, interrupt)
@@ -61,10 +66,21 @@ def interruptible() -> Iterator[None]:
 @contextlib.contextmanager
 def uninterrupted() -> Iterator[None]:
     """A signal raises `Interrupted` only after this."""
-    _Pending.held = True
+    before, _Now.does = _Now.does, "wait"
     try:
         yield
     finally:
-        _Pending.held, number, _Pending.number = False, _Pending.number, None
+        _Now.does, number, _Now.waiting = before, _Now.waiting, None
         if number is not None:
             raise Interrupted(number)
+
+
+@contextlib.contextmanager
+def importing() -> Iterator[None]:
+    """A signal ends the process on the spot. Nothing is begun yet, and some modules crash where an exception meets them
+    while they are imported."""
+    before, _Now.does = _Now.does, "exit"
+    try:
+        yield
+    finally:
+        _Now.does = before

@@ -44,7 +44,9 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
             f"More than half of noise.velocity, {observation.velocity_bound:g} m/s, is needed by "
             f"{escape(', '.join(strained))}: if the errors are not that large, the model is wrong (torchfsid check)"
         )
-    console.print(escape(f"Results: {out}/estimates.csv, regions.json, config.yaml, regions.png, regions.pdf"))
+    files = ("estimates.csv", "regions.json", "config.yaml", "regions.png", "regions.pdf")
+    there = ", ".join(file for file in files if (out / file).exists())
+    console.print(escape(f"Results: {out}/{there}"))
 
 
 def print_hypotheses(hypotheses: Hypotheses, out: Path, console: Console) -> None:

@@ -57,7 +57,8 @@ class ResultsFolder:
             raise ConfigError(f"--out: {self.path} is not a folder")
         held = self._kind_held()
         if self.kind is not None and held not in (None, self.kind):
-            raise ConfigError(f"{self.path}: holds the results of '{held}'; choose another --out, or remove it")
+            what = f"the results of '{held}'" if held else "a config.yaml that is not of a run"
+            raise ConfigError(f"{self.path}: holds {what}; choose another --out, or remove it")
 
     def claim(self, files: Iterable[str], config: str | None = None, resume: bool = False) -> None:
         """Become the owner, remove what an earlier run left, and write config.yaml before anything else.
@@ -77,25 +78,26 @@ class ResultsFolder:
         try:
             _lock(lock, self.path)
             self.require_ours()
-            lock.seek(0)
-            earlier = lock.read().decode(errors="replace").splitlines()
-            names = dict.fromkeys(["config.yaml"] * (config is not None) + [*files])
-            if not resume:
-                lock.truncate(0)
-                for name in dict.fromkeys([*earlier, *names]):
-                    self._remove(name)
-            elif config is not None and _text(self.path / "config.yaml") not in (None, config):
+            if resume and config is not None and _text(self.path / "config.yaml") not in (None, config):
                 raise ConfigError(f"{self.path}: holds another {self.kind}; choose another --out, or remove it")
-            new = [name for name in names if not resume or name not in earlier]
-            with named(self.path / MANIFEST):
-                lock.write("".join(f"{name}\n" for name in new).encode())
-                lock.flush()
-            if config is not None:
-                write_whole(self.path / "config.yaml", config)
         except BaseException:
             lock.close()
             raise
         self._lock = lock
+        lock.seek(0)
+        listed = lock.read().decode(errors="replace").splitlines()
+        names = [*(["config.yaml"] if config is not None else []), *files]
+        if not resume:
+            mine = names if self.kind is None else [*listed, *names]  # who only adds to a folder replaces its own
+            for name in dict.fromkeys(mine):
+                self._remove(name)
+            listed = [name for name in listed if name not in mine]
+        lock.truncate(0)
+        with named(self.path / MANIFEST):
+            lock.write("".join(f"{name}\n" for name in dict.fromkeys([*listed, *names])).encode())
+            lock.flush()
+        if config is not None:
+            write_whole(self.path / "config.yaml", config)
 
     def release(self) -> None:
         """Give the folder back."""
@@ -104,7 +106,7 @@ class ResultsFolder:
             self._lock = None
 
     def _kind_held(self) -> str | None:
-        """Whose config.yaml the folder holds; None without one."""
+        """The kind of command whose config.yaml the folder holds; "" if no command wrote it, None if there is none."""
         from torchfsid.config.documents import read_yaml
 
         path = self.path / "config.yaml"
@@ -113,9 +115,9 @@ class ResultsFolder:
         try:
             content = read_yaml(path)
         except ConfigError:
-            return "somebody else"
+            return ""
         of_observe = "task" in content or "tasks" in content
-        return str(content.get("kind", OBSERVE if of_observe else "somebody else"))
+        return str(content.get("kind", OBSERVE if of_observe else ""))
 
     def _remove(self, name: str) -> None:
         """A file of ours, and its subfolder if nothing else is in it."""

@@ -105,7 +105,7 @@ def digits(value: float, resolution: float) -> str:
     if not math.isfinite(value):
         return "-"
     size = abs(value)
-    resolution = max(resolution, 1e-12 * size)  # beyond that, digits are round-off
+    resolution = max(1e-12 * size, resolution)  # beyond that, digits are round-off; and so if it is NaN
     enough = 2 + math.floor(math.log10(size)) - math.floor(math.log10(resolution)) if size > 0 else 4
     return f"{value:.{max(4, enough)}g}"
 
@@ -125,4 +125,5 @@ def _kernels_are_compiled() -> None:
     from torchfsid.kernels.compiled import folder
 
     with contextlib.suppress(OSError):
+        folder().mkdir(parents=True, exist_ok=True)
         (folder() / "complete").touch()
