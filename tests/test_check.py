@@ -26,6 +26,8 @@ from torchfsid.robots.simulation import Trajectory, simulate
 from torchfsid.robots.tasks import GoalTask, Saturation
 
 GOALS = {"ann": (2.0, 0.1), "bob": (-2.0, 0.0)}
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 BODIES = [*GOALS, "pillar"]
 CONFIG = {
     "task": {"kind": "goal", "gain": 0.9},

@@ -1,6 +1,7 @@
 """The scaffold of all commands: exit codes, one line on stderr, signals, and output that nobody reads."""
 
 import errno
+import math
 import os
 import signal
 import subprocess
@@ -201,10 +202,11 @@ def test_progress_that_cannot_be_shown_stops_nothing(monkeypatch: pytest.MonkeyP
         (2.5, 0.0, "2.5"),
         (1 / 3, 0.0, "0.33333333333333"),
         (float("nan"), 1.0, "-"),
-        (1.23456789, float("nan"), "1.23456789"),
+        (1.23456789, float("nan"), "1.235"),
+        (1.23456789, float("inf"), "1.235"),
     ],
 )
 def test_digits_enough_to_find_a_point_in_its_set(value: float, resolution: float, text: str) -> None:
     assert digits(value, resolution) == text
-    if value == value and resolution > 0:
+    if math.isfinite(value) and math.isfinite(resolution):
         assert abs(float(text) - value) <= max(resolution, 1e-3 * abs(value))

@@ -185,7 +185,9 @@ def _draw_map(axes: Axes, final: dict, x: np.ndarray, seen: np.ndarray, bodies: 
 
 def _draw_sizes(axes: Axes, history: dict[str, dict[str, np.ndarray]]) -> None:
     for i, (robot, of) in enumerate(history.items()):
-        axes.semilogy(_thinned(of["t"]), _thinned(of["diameter"]), color=_colour(i), lw=1.5, label=_plain(robot))
+        axes.plot(_thinned(of["t"]), _thinned(of["diameter"]), color=_colour(i), lw=1.5, label=_plain(robot))
+    if any((of["diameter"] > 0).any() for of in history.values()):  # not so if all sets are points
+        axes.set_yscale("log")
     axes.set(ylabel="diameter [m]", title="Size of the region")
     axes.grid(color="0.93", lw=0.6)
     axes.tick_params(labelbottom=False)

@@ -104,10 +104,11 @@ def digits(value: float, resolution: float) -> str:
     """A number with at least four digits, and with as many as tell apart what is a tenth of `resolution` apart."""
     if not math.isfinite(value):
         return "-"
-    size = abs(value)
-    resolution = max(1e-12 * size, resolution)  # beyond that, digits are round-off; and so if it is NaN
-    enough = 2 + math.floor(math.log10(size)) - math.floor(math.log10(resolution)) if size > 0 else 4
-    return f"{value:.{max(4, enough)}g}"
+    enough, size = 4, abs(value)
+    if size > 0 and math.isfinite(resolution):
+        resolution = max(resolution, 1e-12 * size)  # beyond that, digits are round-off
+        enough = max(4, 2 + math.floor(math.log10(size)) - math.floor(math.log10(resolution)))
+    return f"{value:.{enough}g}"
 
 
 def _first(what: str, shown: Console) -> str:
