@@ -13,14 +13,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from torchfsid.config.barriers import AvoidanceConfig, BarrierConfig
 from torchfsid.config.documents import Strict, apply_overrides, read_yaml, validate, wrong
-from torchfsid.config.observe import (
-    AvoidanceConfig,
-    BarrierConfig,
-    NoiseConfig,
-    PriorConfig,
-    UkfConfig,
-)
+from torchfsid.config.observers import NoiseConfig, PriorConfig, UkfConfig
 from torchfsid.config.quantities import BodyName, NonNegative, Number, PlanarVector, Positive
 from torchfsid.config.tasks import GoalConfig
 from torchfsid.errors import ConfigError

@@ -13,8 +13,9 @@ from pydantic import Field, model_validator
 
 from experiments.config import Text, WholeNumber
 from experiments.teams import TeamConfig
+from torchfsid.config.barriers import AvoidanceConfig
 from torchfsid.config.documents import Strict, apply_overrides, read_yaml, validate, wrong
-from torchfsid.config.observe import AvoidanceConfig, UkfConfig
+from torchfsid.config.observers import UkfConfig
 from torchfsid.config.quantities import NonNegative, Number, PlanarVector, Positive
 from torchfsid.errors import ConfigError
 

@@ -15,7 +15,7 @@ from matplotlib.patches import Circle, Polygon
 from experiments.config import SceneConfig
 from experiments.figures.style import ACTIVE, INACTIVE
 from experiments.saved import Results
-from torchfsid.config.observe import AvoidanceConfig
+from torchfsid.config.barriers import AvoidanceConfig
 
 NO_RADIUS = 0.1
 """Radius of a disc in a scene without safety distance [m]."""

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from experiments.config import SwarmConfig
 from experiments.figures.style import INVERSE_OPTIMAL
-from torchfsid.config.observe import AvoidanceConfig
+from torchfsid.config.barriers import AvoidanceConfig
 
 COLOURS = "viridis_r"
 
