@@ -12,9 +12,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from experiments.config import load_experiment
 from experiments.design.config import load_design
-from experiments.sweep_config import load_sweep
+from experiments.runs.config import load_experiment
+from experiments.sweeps.config import load_sweep
 from torchfsid.errors import ConfigError, FsidError
 
 if TYPE_CHECKING:
@@ -91,10 +91,10 @@ def _run(path: Path, out: Path, overrides: Sequence[str]) -> None:
     from rich.console import Console
     from rich.progress import track
 
-    from experiments.run import run
-    from experiments.swarm import print_swarm
-    from experiments.table import print_table
-    from experiments.verdict import print_verdict
+    from experiments.runs.scene import run
+    from experiments.runs.swarm import print_swarm
+    from experiments.runs.table import print_table
+    from experiments.runs.verdict import print_verdict
 
     torch.set_num_threads(1)  # small tensors: more threads only wait for each other
     progress = Console(stderr=True)
@@ -125,8 +125,8 @@ def _sweep(path: Path, out: Path, overrides: Sequence[str], jobs: int, dask: str
     from torchfsid.commands.results import write_json
 
     try:
-        from experiments.sweep import sweep
-        from experiments.sweep_summary import print_sweep, summarise_sweep
+        from experiments.sweeps.summary import print_sweep, summarise_sweep
+        from experiments.sweeps.sweep import sweep
     except ModuleNotFoundError as error:
         raise ConfigError(f"{error}: install torchfsid[experiments]") from error
 

@@ -16,7 +16,7 @@ from experiments.__main__ import main
 from experiments.design.adaptive import AdaptiveObserver, ConstantGain, NetworkGain, RlsGain, Step
 from experiments.design.config import LearnedObserverConfig, load_design
 from experiments.design.learning import learn
-from experiments.design.recordings import Recording, record
+from experiments.design.rollouts import Recording, record
 from torchfsid.halfspaces import Halfspaces
 
 CONFIG = Path(__file__).parents[1] / "configs" / "learned_observer.yaml"

@@ -17,8 +17,8 @@ from experiments.design.config import ProbePlacementConfig, load_design
 from experiments.design.placement import place
 from experiments.design.probe import Objective, Probing, along, expectation
 from experiments.design.rollout import closed_loop
-from experiments.design.switches import across, summarise_switches
 from experiments.design.tables import read_rows
+from experiments.studies.switches import across, summarise_switches
 from torchfsid.config.documents import dump
 from torchfsid.identification.evidence import SetKind
 from torchfsid.observers.set_membership import SetMembershipObserver

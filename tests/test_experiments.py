@@ -14,12 +14,12 @@ import pytest
 import torch
 
 from experiments.__main__ import main
-from experiments.config import CasesConfig, ExpectedConfig, SceneConfig, load_experiment
 from experiments.figures.style import length
-from experiments.recording import simulate_scene
-from experiments.run import run
-from experiments.saved import SETS, Results
-from experiments.summary import compare, stays_below, timeline
+from experiments.runs.config import CasesConfig, ExpectedConfig, SceneConfig, load_experiment
+from experiments.runs.recording import simulate_scene
+from experiments.runs.saved import SETS, Results
+from experiments.runs.scene import run
+from experiments.runs.summary import compare, stays_below, timeline
 from torchfsid.config.documents import dump
 from torchfsid.logs.log import read_csv
 

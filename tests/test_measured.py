@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from experiments.config import SceneConfig
-from experiments.recording import Scene, simulate_scene
-from experiments.sweep_config import load_sweep
+from experiments.runs.config import SceneConfig
+from experiments.runs.recording import Scene, simulate_scene
+from experiments.sweeps.config import load_sweep
 from experiments.teams import TeamConfig
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.sets.feasible_set import FeasibleSet

@@ -11,7 +11,7 @@ import jaxtyping
 import pytest
 
 from experiments.__main__ import main
-from experiments.config import SwarmConfig, load_experiment
+from experiments.runs.config import SwarmConfig, load_experiment
 
 SWARM = Path(__file__).parents[1] / "configs" / "swarm.yaml"
 SMALL = ("robots=60", "side=7.5", "duration=0.9", "snapshots=[0.3, 0.9]")

@@ -18,11 +18,11 @@ import pytest
 from distributed import LocalCluster
 
 from experiments.__main__ import main
-from experiments.journal import Journal
-from experiments.sweep import sweep
-from experiments.sweep_config import load_sweep
-from experiments.sweep_summary import summarise_sweep
-from experiments.sweep_tables import read_table
+from experiments.sweeps.config import load_sweep
+from experiments.sweeps.journal import Journal
+from experiments.sweeps.summary import summarise_sweep
+from experiments.sweeps.sweep import sweep
+from experiments.sweeps.tables import read_table
 from torchfsid.errors import ConfigError
 
 ROOT = Path(__file__).parents[1]

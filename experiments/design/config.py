@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from experiments.config import Text, WholeNumber
+from experiments.runs.config import Text, WholeNumber
 from experiments.teams import TeamConfig
 from torchfsid.config.documents import Strict, apply_overrides, read_yaml, validate, wrong
 from torchfsid.config.observe import AvoidanceConfig, UkfConfig

@@ -8,9 +8,9 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from experiments.design.config import ProbePlacementConfig, load_design
-from experiments.design.learning_figure import draw_learning
-from experiments.design.probe_animation import animate
-from experiments.design.probe_figures import draw_before_after, draw_search
+from experiments.figures.learning import draw_learning
+from experiments.figures.probe import draw_before_after, draw_search
+from experiments.figures.probe_animation import animate
 
 Save = Callable[[Figure, Path, str], list[Path]]
 

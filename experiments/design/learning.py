@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from experiments.design.adaptive import AdaptiveObserver, ConstantGain, NetworkGain, RlsGain
 from experiments.design.config import LearnedObserverConfig
-from experiments.design.recordings import Recording, record
+from experiments.design.rollouts import Recording, record
 from experiments.design.tables import Track, write_rows
 from torchfsid.commands.results import write_json
 from torchfsid.config.documents import dump

@@ -25,11 +25,11 @@ import torch
 from torch import Tensor
 
 from experiments.design.config import ProbePlacementConfig
-from experiments.design.gradient_check import check_gradients, nothing_to_follow
 from experiments.design.probe import Probing, along
 from experiments.design.search import METHODS, Evaluated, Search, choose
-from experiments.design.switches import across, summarise_switches
 from experiments.design.tables import Track, write_rows
+from experiments.studies.gradient_check import check_gradients, nothing_to_follow
+from experiments.studies.switches import across, summarise_switches
 from torchfsid.commands.results import write_json
 from torchfsid.config.documents import dump
 

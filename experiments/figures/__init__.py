@@ -7,7 +7,6 @@ from pathlib import Path
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from experiments.config import CasesConfig, SwarmConfig
 from experiments.design.config import MODELS as DESIGNS
 from experiments.figures.animation import animate
 from experiments.figures.cases import draw_cases
@@ -15,7 +14,8 @@ from experiments.figures.single import draw_single
 from experiments.figures.style import STYLE
 from experiments.figures.swarm import draw_swarm
 from experiments.figures.team import draw_comparison, draw_team
-from experiments.saved import Results
+from experiments.runs.config import CasesConfig, SwarmConfig
+from experiments.runs.saved import Results
 from torchfsid.config.documents import load, read_yaml
 
 
@@ -52,7 +52,7 @@ def draw(folder: Path) -> list[Path]:
 
 def _draw_sweep(folder: Path) -> list[Path]:
     from experiments.figures.sweep import draw_sweep
-    from experiments.swept import Swept
+    from experiments.sweeps.swept import Swept
 
     swept = Swept(folder)
     if len(swept.config.axes) < 2:

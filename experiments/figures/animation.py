@@ -16,7 +16,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from experiments.config import SceneConfig
 from experiments.figures.drawing import (
     add_goal,
     add_obstacles,
@@ -29,8 +28,9 @@ from experiments.figures.drawing import (
     padded,
 )
 from experiments.figures.style import HYBRID, ROBOT, SET_COLOURS, TEAM, UKF, length
-from experiments.lengths import lengths
-from experiments.saved import Results
+from experiments.runs.config import SceneConfig
+from experiments.runs.lengths import lengths
+from experiments.runs.saved import Results
 
 FRAMES = 100
 FRAME_MS, LAST_FRAME_MS = 60, 2000

@@ -10,11 +10,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon, Rectangle
 
-from experiments.config import CasesConfig
 from experiments.figures.drawing import add_goal, add_region
 from experiments.figures.style import ACTIVE, CURVES, INVERSE_OPTIMAL, REGION, ROBOT, SET_COLOURS, UKF
-from experiments.lengths import lengths
-from experiments.saved import Region, Results
+from experiments.runs.config import CasesConfig
+from experiments.runs.lengths import lengths
+from experiments.runs.saved import Region, Results
 
 SHADOW = 20.0
 """How far the forbidden side of a row is drawn, in units of the panel [m/s]."""

@@ -12,9 +12,9 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.patches import Circle, Polygon
 
-from experiments.config import SceneConfig
 from experiments.figures.style import ACTIVE, INACTIVE
-from experiments.saved import Results
+from experiments.runs.config import SceneConfig
+from experiments.runs.saved import Results
 from torchfsid.config.observe import AvoidanceConfig
 
 NO_RADIUS = 0.1

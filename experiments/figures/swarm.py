@@ -13,8 +13,8 @@ from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from experiments.config import SwarmConfig
 from experiments.figures.style import INVERSE_OPTIMAL
+from experiments.runs.config import SwarmConfig
 from torchfsid.config.observe import AvoidanceConfig
 
 COLOURS = "viridis_r"

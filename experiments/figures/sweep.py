@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from experiments.figures.style import HYBRID, INVERSE_OPTIMAL, REGION, UKF
-from experiments.swept import Swept, short
+from experiments.sweeps.swept import Swept, short
 
 BAND = (0.1, 0.9)
 SIZES = (

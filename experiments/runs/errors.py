@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from experiments.config import SceneConfig
+from experiments.runs.config import SceneConfig
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.robots.barriers import Barrier, stack_barriers
 from torchfsid.robots.measurement import Measurement

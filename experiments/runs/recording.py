@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from experiments.config import SceneConfig
-from experiments.errors import measure
+from experiments.runs.config import SceneConfig
+from experiments.runs.errors import measure
 from torchfsid.robots.barriers import Barrier
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from experiments.config import CasesConfig, SceneConfig, SwarmConfig, load_experiment
+from experiments.runs.config import CasesConfig, SceneConfig, SwarmConfig, load_experiment
 
 SETS: tuple[Literal["critical_region", "inverse_optimal"], ...] = ("critical_region", "inverse_optimal")
 

@@ -25,8 +25,8 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from experiments.config import SwarmConfig
-from experiments.errors import in_disc
+from experiments.runs.config import SwarmConfig
+from experiments.runs.errors import in_disc
 from torchfsid.commands.results import STATUS_NAMES, write_json
 from torchfsid.config.documents import dump
 from torchfsid.identification.kkt import CASES

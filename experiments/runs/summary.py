@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from experiments.config import ExpectedConfig, ExperimentConfig, SceneConfig
-from experiments.lengths import lengths, prior_lengths
-from experiments.observers import Observers
-from experiments.saved import Results
+from experiments.runs.config import ExpectedConfig, ExperimentConfig, SceneConfig
+from experiments.runs.lengths import lengths, prior_lengths
+from experiments.runs.observers import Observers
+from experiments.runs.saved import Results
 from torchfsid.robots.simulation import Trajectory
 
 SHARES = (0.1, 0.01)

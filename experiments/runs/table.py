@@ -15,10 +15,10 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from experiments.config import CasesConfig
-from experiments.observers import Observers
-from experiments.saved import SETS, Results
-from experiments.summary import settings
+from experiments.runs.config import CasesConfig
+from experiments.runs.observers import Observers
+from experiments.runs.saved import SETS, Results
+from experiments.runs.summary import settings
 
 LEARNED = 0.1
 """Share of the prior's standard deviation."""

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from experiments.figures.style import length
-from experiments.sweep_config import SweepConfig, load_sweep
-from experiments.sweep_tables import read_table
+from experiments.sweeps.config import SweepConfig, load_sweep
+from experiments.sweeps.tables import read_table
 
 
 @dataclass(frozen=True)
 class Swept:
-    """Columns of its tables are those of `experiments.outcome`; runs that failed are left out."""
+    """Columns of its tables are those of `experiments.sweeps.record`; runs that failed are left out."""
 
     folder: Path
 

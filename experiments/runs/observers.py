@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 
 import torch
 
-from experiments.config import ExperimentConfig
-from experiments.recording import Recording
-from experiments.saved import SETS
-from experiments.tally import SetTally, Tally
+from experiments.runs.config import ExperimentConfig
+from experiments.runs.recording import Recording
+from experiments.runs.saved import SETS
+from experiments.runs.tally import SetTally, Tally
 from torchfsid.observers.hybrid import HybridEstimate, HybridObserver
 from torchfsid.observers.set_membership import SetEstimate, SetMembershipObserver
 from torchfsid.observers.ukf import ParameterUkf

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from experiments.design.config import ProbePlacementConfig
-from experiments.design.probe_figures import draw_map, name_of
 from experiments.design.tables import read_json
+from experiments.figures.probe import draw_map, name_of
 
 FRAME_MS, LAST_FRAME_MS = 120, 2000
 FRAMES = 40

@@ -14,10 +14,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from experiments.config import SceneConfig
-from experiments.observers import Observers
-from experiments.recording import Scene, simulate_scene
-from experiments.saved import SETS
+from experiments.runs.config import SceneConfig
+from experiments.runs.observers import Observers
+from experiments.runs.recording import Scene, simulate_scene
+from experiments.runs.saved import SETS
 from torchfsid.identification.active_set import active_set
 from torchfsid.identification.kkt import CASES, solve_kkt
 from torchfsid.observers.hybrid import HybridEstimate

@@ -1,7 +1,7 @@
 """The files of `python -m experiments sweep`: many runs of a scene, over a grid, with random teams.
 
-`experiment` is a scene (`experiments.config`) without what the sweep fills in: `title`, `seed`, `snapshots`, and, where
-a `team` is to be drawn, `robots` and `obstacles`. Every point of the grid is run `repeats` times. Run i draws all that
+`experiment` is a scene (`experiments.runs.config`) without what the sweep fills in: `title`, `seed`, `snapshots`, and,
+where a `team` is to be drawn, `robots` and `obstacles`. Every point of the grid is run `repeats` times. Run i draws all that
 is random from child i of one `numpy.random.SeedSequence`: it is the same run in whatever order, on however many
 workers. No torch in this module.
 """
@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from experiments.config import SceneConfig, Text, WholeNumber, require_increasing
+from experiments.runs.config import SceneConfig, Text, WholeNumber, require_increasing
 from experiments.teams import TeamConfig
 from torchfsid.config.documents import Strict, apply_overrides, read_yaml, validate, wrong
 from torchfsid.config.quantities import NonNegative, Number

@@ -18,8 +18,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from experiments.config import CaseConfig, CasesConfig
-from experiments.recording import Recording
+from experiments.runs.config import CaseConfig, CasesConfig
+from experiments.runs.recording import Recording
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement
 

@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.figures.style import length
-from experiments.saved import SETS
-from experiments.swept import Swept, short
+from experiments.runs.saved import SETS
+from experiments.sweeps.swept import Swept, short
 
 SIZES = ("sqrt_area", "diameter", "centroid_error")
 COUNTS = ("lost_and_inconsistent", "lost_in_silence", "alarm", "inconsistent")

@@ -1,4 +1,4 @@
-"""What an observer says when its model is wrong. `python -m experiments.wrong_models` prints the table.
+"""What an observer says when its model is wrong. `python -m experiments.studies.wrong_models` prints the table.
 
 Teams of four robots cross a disc with two pillars, one joint QP over each team (`neighbour_velocity: current`), with
 random goals. Controls are measured with errors of a given size, in random directions. Each model is wrong in one thing.
@@ -194,7 +194,7 @@ def automatic(model: Model, samples: list[Measurement], goals: Tensor, neighbour
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m experiments.wrong_models")
+    parser = argparse.ArgumentParser(prog="python -m experiments.studies.wrong_models")
     parser.add_argument("--seeds", type=int, default=12, help="runs per model and bound")
     parser.add_argument("--auto", action="store_true", help="take the bound that velocity: auto would")
     chosen = parser.parse_args(arguments)

@@ -2,7 +2,7 @@
 
     DIR/config.yaml                  the resolved sweep
     DIR/records.jsonl                a line per finished run, in the order in which they finished: the journal
-    DIR/runs.csv, runs.parquet       a row per run; DIR/series.*: rows per run, time and robot (`experiments.outcome`)
+    DIR/runs.csv, runs.parquet       a row per run; DIR/series.*: rows per run, time and robot (`experiments.sweeps.record`)
     DIR/timings.csv                  how long each run took: the only table that differs from one sweep to the next
 
 Workers only compute; this process alone writes. The tables are made from the journal and sorted by run, so they are the
@@ -18,10 +18,10 @@ from typing import Any
 
 import joblib
 
-from experiments.journal import Journal
-from experiments.outcome import outcome
-from experiments.sweep_config import SweepConfig
-from experiments.sweep_tables import write_tables
+from experiments.sweeps.config import SweepConfig
+from experiments.sweeps.journal import Journal
+from experiments.sweeps.record import outcome
+from experiments.sweeps.tables import write_tables
 from torchfsid.config.documents import dump
 from torchfsid.errors import ConfigError, FsidError, one_line
 

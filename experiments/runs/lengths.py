@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from experiments.saved import SETS, Results
+from experiments.runs.saved import SETS, Results
 
 
 def lengths(results: Results) -> dict[str, np.ndarray]:

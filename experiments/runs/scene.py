@@ -19,14 +19,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from experiments.cases import record_cases
-from experiments.config import CasesConfig, RunConfig, SwarmConfig
-from experiments.observers import Observers
-from experiments.recording import Recording, simulate_scene
-from experiments.saved import Results
-from experiments.summary import summarise_scene
-from experiments.swarm import run_swarm
-from experiments.table import measure_cases
+from experiments.runs.cases import record_cases
+from experiments.runs.config import CasesConfig, RunConfig, SwarmConfig
+from experiments.runs.observers import Observers
+from experiments.runs.recording import Recording, simulate_scene
+from experiments.runs.saved import Results
+from experiments.runs.summary import summarise_scene
+from experiments.runs.swarm import run_swarm
+from experiments.runs.table import measure_cases
 from torchfsid.commands.results import ResultsWriter, write_json
 from torchfsid.config.documents import dump
 from torchfsid.observers.set_membership import SetEstimate

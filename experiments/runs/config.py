@@ -51,7 +51,7 @@ class MeasurementNoiseConfig(Strict):
     """The errors of what the observer sees of the robots, of at most these lengths [m/s], [m].
 
     `shape`: `uniform` in discs; `bias`: one error of full length per robot, the same at all times; `adversarial`: of
-    full length, chosen at every sample by somebody who knows the truth and the observer (`experiments.errors`).
+    full length, chosen at every sample by somebody who knows the truth and the observer (`experiments.runs.errors`).
     """
 
     velocity: NonNegative = 0.0

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 
-from experiments.sweep_config import SweepConfig
+from experiments.sweeps.config import SweepConfig
 
 
 def write_tables(out: Path, config: SweepConfig, records: list[dict[str, Any]]) -> None:
