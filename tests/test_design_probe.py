@@ -63,7 +63,7 @@ def test_whole_pipeline_against_finite_differences(kind: str):
     placement = tensor([[[0.62, 0.05], [0.9, -0.1], [0.8, 0.2]]])
 
     def log_area(at: Tensor) -> Tensor:
-        return probing.outcome(at, goals, steps=12).area[0].log()
+        return probing.left(at, goals, steps=12).area[0].log()
 
     jacobian = torch.autograd.functional.jacobian(log_area, placement).flatten(1)
     step = 1e-6
@@ -120,7 +120,7 @@ def test_gradient_of_the_mean_in_the_corridor(horizon: int):
     goals, placement, step = probing.draw_goals(2048, seed=1), tensor([[[0.65, 0.06]]]), 0.01
 
     def mean(at: Tensor) -> Tensor:
-        return expectation(probing.outcome(at, goals, horizon).area, "area").sum()
+        return expectation(probing.left(at, goals, horizon).area, "area").sum()
 
     gradient = torch.autograd.functional.jacobian(mean, placement).flatten()
     steps = step * torch.eye(2, dtype=torch.float64).reshape(2, 1, 1, 2)
@@ -153,11 +153,11 @@ def test_a_probe_that_comes_too_close_teaches_nothing():
     probing = Probing.of(load())
     goals = probing.draw_goals(4, seed=0)
     over_the_robot = tensor([[[0.6, 0.0], [0.1, 0.0], [-0.4, 0.0]]]).requires_grad_()
-    outcome = probing.outcome(over_the_robot, goals)
+    outcome = probing.left(over_the_robot, goals)
     assert not outcome.sound.any()
     assert (outcome.area == probing.prior_area).all()
     assert not outcome.area.requires_grad or torch.autograd.grad(outcome.area.sum(), over_the_robot)[0].norm() == 0
-    beside = probing.outcome(tensor([[[0.6, 0.0]]]), goals)
+    beside = probing.left(tensor([[[0.6, 0.0]]]), goals)
     assert beside.sound.all()
     assert (beside.area < probing.prior_area).all()
 
@@ -170,7 +170,7 @@ def test_a_set_that_has_lost_its_goal_teaches_nothing():
         goals = probing.draw_goals(128, seed=0)
         *_, last = probing.samples(placement, goals)
         out = ~last.estimate.feasible_set.contains(goals, 1e-9)
-        outcome = probing.outcome(placement, goals)
+        outcome = probing.left(placement, goals)
         assert torch.equal(outcome.sound[0], last.sound & ~out)
         assert (outcome.area[0, out] == probing.prior_area).all()
         lost.append(int((last.sound & out).sum()))
@@ -193,7 +193,7 @@ def test_allowed_placements_keep_the_safety_distance_and_the_room():
 
 def test_without_a_probe_the_corridor_hides_the_goal():
     probing = Probing.of(load())
-    assert probing.outcome(None, probing.draw_goals(8, seed=0)).area.tolist() == [[1.0] * 8]
+    assert probing.left(None, probing.draw_goals(8, seed=0)).area.tolist() == [[1.0] * 8]
 
 
 def test_a_probe_along_its_way_points():

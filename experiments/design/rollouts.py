@@ -16,21 +16,25 @@ from torch import Tensor
 
 from experiments.design.adaptive import Step
 from experiments.design.config import LearnedObserverConfig
-from experiments.design.rollout import closed_loop
 from torchfsid.observers.hybrid import HybridObserver
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.observers.ukf import ParameterUkf
 from torchfsid.robots.bounds import NoiseBound
+from torchfsid.robots.controller import CbfQpController
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.simulation import closed_loop
 from torchfsid.robots.tasks import GoalTask
 from torchfsid.sets.feasible_set import FeasibleSet
 
 
 @dataclass(frozen=True)
-class Recording:
-    """`steps` of B robots (teams one after the other), their goals, and what the other observers estimate.
+class Rollouts:
+    """What was seen of B robots, teams one after the other, and what other observers make of it.
 
     Attributes:
-        goals: the truth [m]. noise: bound of the disturbance [m/s].
+        steps: sample by sample, what an adaptive observer uses.
+        goals: the truth [m].
+        noise: bound of the disturbance [m/s].
         theta, information: centre and information matrix of the prior.
         estimates: by observer, (T, B, 2) [m]: `centroid`, and where filters were run `ukf` and `hybrid`.
         contains: the share of samples at which Theta(t) holds the truth.
@@ -45,9 +49,9 @@ class Recording:
     contains: float
 
 
-def record(
+def roll_out(
     config: LearnedObserverConfig, noise: float, teams: int, seed: np.random.SeedSequence, filters: bool
-) -> Recording:
+) -> Rollouts:
     """Draw and run teams, all in one batch. `filters`: run the UKF and the hybrid too, which takes longest."""
     random = np.random.default_rng(seed)
     scenes = [config.team.draw(random) for _ in range(teams)]
@@ -63,21 +67,22 @@ def record(
     radius, angle = torch.from_numpy(np.sqrt(in_disc[0])), torch.from_numpy(2 * np.pi * in_disc[1])
     disturbance = (noise * radius).unsqueeze(-1) * torch.stack([angle.cos(), angle.sin()], dim=-1)
 
-    def bodies(_: int, x: Tensor) -> Tensor:
-        team = x.reshape(-1, 1, N, 2).expand(-1, N, -1, -1)
-        return torch.cat([team, obstacles], dim=2).flatten(0, 1)
-
     others = torch.cat([~torch.eye(N, dtype=torch.bool), torch.ones(N, K, dtype=torch.bool)], dim=1)
+    present = others.repeat(len(scenes), 1)
+
+    def around(t: float, x: Tensor, _: Tensor) -> Measurement:
+        team = x.reshape(-1, 1, N, 2).expand(-1, N, -1, -1)
+        return Measurement(t=t, x=x, u=None, bodies=torch.cat([team, obstacles], dim=2).flatten(0, 1), present=present)
+
     task, barriers = GoalTask(config.gain), [config.avoidance.build([])]
+    truth, start = goals.flatten(0, 1), starts.flatten(0, 1)
     loop = closed_loop(
-        task,
-        barriers,
-        goals.flatten(0, 1),
-        starts.flatten(0, 1),
-        bodies,
-        others.repeat(len(scenes), 1),
+        CbfQpController(task, barriers),
+        truth,
+        start,
+        around,
         dt=config.dt,
-        steps=config.steps,
+        samples=config.steps,
         disturbance=disturbance,
     )
     lower, upper = (torch.tensor(bound, dtype=torch.float64) for bound in (config.prior.lower, config.prior.upper))
@@ -89,15 +94,15 @@ def record(
     hybrid = _hybrid(config, sets, noise) if filters else None
     steps, estimates, contained = [], {"centroid": [], **({"ukf": [], "hybrid": []} if filters else {})}, []
     with torch.no_grad():
-        for seen in loop:
+        for measurement, _ in loop:
             if hybrid is None:
-                estimate = sets.update(seen.measurement)
+                estimate = sets.update(measurement)
             else:
-                both = hybrid.update(seen.measurement)
+                both = hybrid.update(measurement)
                 estimate = both.set_estimate
                 estimates["ukf"].append(both.ukf_estimate.theta)
                 estimates["hybrid"].append(both.theta)
-            theta_set, u = estimate.feasible_set, seen.measurement.u
+            theta_set, u = estimate.feasible_set, measurement.u
             assert u is not None
             kkt = estimate.kkt
             # A sample that says nothing moves no estimate.
@@ -105,10 +110,10 @@ def record(
             facets, area, centroid = theta_set.facets().halfspaces, theta_set.volume(), estimate.theta
             steps.append(Step(facets, area, centroid, kkt.case, G, kkt.f, u, noise))
             estimates["centroid"].append(centroid)
-            contained.append(theta_set.contains(goals.flatten(0, 1)).double().mean())
-    return Recording(
+            contained.append(theta_set.contains(truth).double().mean())
+    return Rollouts(
         steps,
-        goals.flatten(0, 1),
+        truth,
         noise,
         ((lower + upper) / 2).expand(B, 2),
         torch.diag_embed(1 / spread**2).expand(B, 2, 2),

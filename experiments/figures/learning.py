@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from matplotlib.figure import Figure
 
 from experiments.design.config import LearnedObserverConfig
-from experiments.design.tables import read_rows
 from experiments.figures.style import HYBRID, INVERSE_OPTIMAL, REGION, ROBOT, UKF
+from experiments.results import read_columns
 
 OBSERVERS = {
     "centroid": ("0.45", "-"),
@@ -26,29 +27,30 @@ OBSERVERS = {
 CASES = {"A": "0.8", "B": INVERSE_OPTIMAL, "D": ROBOT}
 
 
-def draw_learning(folder: Path, config: LearnedObserverConfig) -> Figure:
+def draw_learning(folder: Path, config: LearnedObserverConfig) -> Iterator[tuple[str, Figure]]:
     levels = config.unseen_noise
     figure = Figure(figsize=(3.4 * max(len(levels), 3), 5.2), layout="constrained")
     grid = figure.add_gridspec(2, 6, height_ratios=(1.25, 1))
-    curves, width = read_rows(folder / "curves.csv"), 6 // max(len(levels), 1)
+    curves, width = read_columns(folder / "curves.csv"), 6 // max(len(levels), 1)
     shared = None
     for i, noise in enumerate(levels):
         axes = figure.add_subplot(grid[0, i * width : (i + 1) * width], sharey=shared)
         shared = shared or axes
         for name, (colour, dashes) in OBSERVERS.items():
-            rows = [row for row in curves if row["observer"] == name and float(row["noise"]) == noise]
-            t, error = ([float(row[key]) for row in rows] for key in ("t", "error"))
-            axes.semilogy(t, error, color=colour, ls=dashes, lw=1.4, label=name.replace("ukf", "UKF"))
+            of = curves.where(observer=name, noise=noise)
+            axes.semilogy(
+                of.numbers("t"), of.numbers("error"), color=colour, ls=dashes, lw=1.4, label=name.replace("ukf", "UKF")
+            )
         axes.set(xlabel="t [s]", ylabel="mean error [m]" if i == 0 else "")
         axes.set_title(f"({'abcdef'[i]}) unseen teams, δ = {noise:g} m/s", fontweight="bold")
         axes.grid(True, which="both")
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=9, fontsize=7)
 
     training = figure.add_subplot(grid[1, :3])
-    rows = read_rows(folder / "training.csv")
+    epochs = read_columns(folder / "training.csv")
     for name, colour in (("constant, learned", "#56B4E9"), ("network", INVERSE_OPTIMAL), ("network with pull", ROBOT)):
         for column, dashes in (("training", "-"), ("validation", ":")):
-            values = [float(row[column]) for row in rows if row["gain"] == name]
+            values = epochs.where(gain=name).numbers(column)
             label = name if column == "training" else None
             training.plot(values, color=colour, ls=dashes, lw=1.3, label=label)
     training.set(xlabel="epoch", ylabel="mean error [m]")
@@ -57,16 +59,16 @@ def draw_learning(folder: Path, config: LearnedObserverConfig) -> Figure:
     training.legend(fontsize=7, loc="center right", bbox_to_anchor=(1, 0.38))
 
     pull = figure.add_subplot(grid[1, 3:])
-    rows = read_rows(folder / "answers.csv")
+    answers = read_columns(folder / "answers.csv")
     for letter, colour in CASES.items():
         for noise, dashes in zip(config.noise, ("-", "--", ":"), strict=False):
-            of = [row for row in rows if row["case"] == letter and float(row["noise"]) == noise]
+            of = answers.where(case=letter, noise=noise)
             label = f"case {letter}" if dashes == "-" else None
-            area, answer = ([float(row[key]) for row in of] for key in ("area", "pull"))
-            pull.semilogx(area, answer, color=colour, ls=dashes, lw=4 if letter == "A" else 1.3, label=label)
+            looks = {"color": colour, "ls": dashes, "lw": 4 if letter == "A" else 1.3}
+            pull.semilogx(of.numbers("area"), of.numbers("pull"), label=label, **looks)
     pull.set(xlabel="area of Θ [m²]", ylabel="pull to the centroid", ylim=(0, 1))
     pull.set_title("(e) what the network has learned (solid: least noise)", fontweight="bold")
     pull.grid(True)
     pull.legend(fontsize=7)
     figure.suptitle(config.title, fontsize=9, x=0.01, ha="left")
-    return figure
+    yield "figure", figure

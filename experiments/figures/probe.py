@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,9 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
 from experiments.design.config import ProbePlacementConfig
-from experiments.design.tables import read_json, read_rows
 from experiments.figures.drawing import add_goal, add_region, add_robot
 from experiments.figures.style import HYBRID, INACTIVE, INVERSE_OPTIMAL, REGION, ROBOT, UKF
+from experiments.results import Columns, read_columns, read_json, reading
 
 PROBE = INVERSE_OPTIMAL
 SEEN = 0.95
@@ -35,6 +34,9 @@ METHODS = {
 }
 """Label and colour of each method."""
 
+MARKERS = {"random": "s", "grid": "D", "cem": "P", "adam": "*"}
+"""Of those that are shown on the map."""
+
 
 def draw_search(folder: Path, config: ProbePlacementConfig) -> Figure:
     figure = Figure(figsize=(11.5, 6.0), layout="constrained")
@@ -48,9 +50,10 @@ def draw_search(folder: Path, config: ProbePlacementConfig) -> Figure:
 
 
 def _landscape(axes: Axes, folder: Path, config: ProbePlacementConfig) -> None:
-    rows = read_rows(folder / "landscape.csv")
-    columns, lines = config.landscape
-    mean = np.array([float(row["mean_area"] or "nan") for row in rows]).reshape(lines, columns)
+    path, (columns, lines) = folder / "landscape.csv", config.landscape
+    table = read_columns(path)
+    with reading(path):
+        mean = table.numbers("mean_area").reshape(lines, columns)
     (left, bottom), (right, top) = config.room.lower, config.room.upper
     low, high = np.nanmin(mean), np.nanmax(mean)
     image = axes.imshow(
@@ -63,20 +66,20 @@ def _landscape(axes: Axes, folder: Path, config: ProbePlacementConfig) -> None:
     bar.ax.minorticks_off()
     bar.ax.yaxis.set_major_formatter("{x:g}")
 
-    first = read_json(folder / "placements.json")[0]
-    _corridor(axes, first["obstacles"], config)
+    obstacles, chosen = _first_corridor(folder / "placements.json")
+    _corridor(axes, obstacles, config)
     start_x, start_y = config.start
     axes.add_patch(Circle((start_x, start_y), config.safety_distance, fc="none", ec="black", ls=":", lw=1))
-    for way in _ways(read_rows(folder / "descent.csv")):
-        found = (way == first["chosen"]["1"]["adam"][0]).all(-1).any()
+    for way in _ways(read_columns(folder / "descent.csv")):
+        found = (way == chosen["adam"]).all(-1).any()
         axes.plot(*way.T, color="white", lw=1.8 if found else 0.5, alpha=1.0 if found else 0.6, zorder=3 + found)
         axes.plot(*way[0], "o", color="white", ms=5.0 if found else 2.4, mec="black", mew=0.4, zorder=3 + found)
-    for name, marker in (("random", "s"), ("grid", "D"), ("cem", "P"), ("adam", "*")):
-        x, y = first["chosen"]["1"][name][0]
+    for name, marker in MARKERS.items():
+        x, y = chosen[name]
         label, colour = METHODS[name]
         size = 12 if name == "adam" else 7
         axes.plot(x, y, marker, color=colour, ms=size, mec="black", mew=0.8, label=label, ls="", zorder=6)
-    places = np.array([(float(row["x"]), float(row["y"])) for row in rows])
+    places = np.stack([table.numbers("x"), table.numbers("y")], axis=-1)
     matter = mean.ravel() < (SEEN * high if low < SEEN * high else np.inf)
     seen = np.vstack([places[matter], np.array([config.start]) - config.safety_distance / 2])
     left, bottom = np.maximum(seen.min(0) - 0.05, config.room.lower)
@@ -86,13 +89,19 @@ def _landscape(axes: Axes, folder: Path, config: ProbePlacementConfig) -> None:
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=4, fontsize=7, columnspacing=1.2)
 
 
-def _ways(rows: list[dict[str, str]]) -> list[np.ndarray]:
+def _ways(table: Columns) -> list[np.ndarray]:
     """The places on the way down from each start. A start that goes on from one stage to the next does so from the best
     of its places."""
-    ways: dict[str, list[tuple[float, float]]] = defaultdict(list)
-    for row in rows:
-        ways[row["start"]].append((float(row["x"]), float(row["y"])))
-    return [np.array(way) for way in ways.values()]
+    places = np.stack([table.numbers("x"), table.numbers("y")], axis=-1)
+    return [places[table["start"] == start] for start in dict.fromkeys(table["start"])]
+
+
+def _first_corridor(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Its obstacles, and where each method would let a still probe stand."""
+    with reading(path):
+        first = read_json(path)[0]
+        chosen = {name: np.array(at[0], dtype=float).reshape(2) for name, at in first["chosen"]["1"].items()}
+        return np.array(first["obstacles"], dtype=float).reshape(-1, 2), {name: chosen[name] for name in MARKERS}
 
 
 def _corridor(axes: Axes, obstacles: list[list[float]], config: ProbePlacementConfig) -> None:
@@ -102,14 +111,14 @@ def _corridor(axes: Axes, obstacles: list[list[float]], config: ProbePlacementCo
 
 
 def _methods(axes: Axes, folder: Path, config: ProbePlacementConfig) -> None:
-    rows = read_rows(folder / "runs.csv")
+    runs = read_columns(folder / "runs.csv")
     ticks: list[float] = []
     labels, y = [], 0.0
     for K in config.way_points:
         still = "a probe that stands still" if K == 1 else f"a path of {K} way-points"
         axes.text(0.01, y, still, transform=axes.get_yaxis_transform(), fontstyle="italic", va="center")
         for name, (label, colour) in METHODS.items():
-            areas = np.array([float(r["mean_area"]) for r in rows if (r["method"], r["way_points"]) == (name, str(K))])
+            areas = runs.where(method=name, way_points=K).numbers("mean_area")
             if len(areas) == 0:
                 continue
             y -= 1
@@ -131,16 +140,15 @@ def _methods(axes: Axes, folder: Path, config: ProbePlacementConfig) -> None:
 
 
 def _cosines(axes: Axes, folder: Path) -> None:
-    rows = read_rows(folder / "gradient_check.csv")
+    checks = read_columns(folder / "gradient_check.csv")
     for objective, colour in (("area", REGION), ("log_area", UKF)):
-        for K, marker in zip(sorted({row["way_points"] for row in rows}, key=int), "os^", strict=False):
-            of = [row for row in rows if row["objective"] == objective and row["way_points"] == K]
-            horizon = [int(row["horizon"]) for row in of]
+        for K, marker in zip(np.unique(checks.numbers("way_points")).astype(int), "os^", strict=False):
+            of = checks.where(objective=objective, way_points=K)
             name = {"area": "A", "log_area": "log A"}[objective]
             for column, dashes, which in (("cosine", "-", ""), ("cosine_without", ":", ", no score")):
                 label = f"{name}{which}" if marker == "o" else None
-                values = [float(row[column]) for row in of]
-                axes.plot(horizon, values, dashes, color=colour, marker=marker, ms=4, lw=1.3, label=label)
+                looks = {"color": colour, "marker": marker, "ms": 4, "lw": 1.3}
+                axes.plot(of.numbers("horizon"), of.numbers(column), dashes, label=label, **looks)
     axes.axhline(0.95, color="0.6", lw=0.6)
     axes.set(xlabel="samples", ylabel="cosine", ylim=(-1.9, 1.05), yticks=(-1, -0.5, 0, 0.5, 1))
     axes.set_title("(c) gradient against differences", fontweight="bold")
@@ -149,11 +157,9 @@ def _cosines(axes: Axes, folder: Path) -> None:
 
 
 def _switches(axes: Axes, folder: Path) -> None:
-    rows = read_rows(folder / "switches.csv")
-    y, log_area, by_derivatives = (
-        np.array([float(row[key]) for row in rows]) for key in ("y", "log_area", "by_derivatives")
-    )
-    history = np.array([int(row["switches"]) for row in rows])
+    table = read_columns(folder / "switches.csv")
+    y, log_area, by_derivatives = (table.numbers(key) for key in ("y", "log_area", "by_derivatives"))
+    history = table.numbers("switches").astype(int)
     for i in range(history[-1] + 1):
         axes.plot(y[history == i], log_area[history == i], "-", color=REGION, lw=1.6, label=None if i else "log A")
     axes.plot(y, by_derivatives, ":", color=UKF, lw=1.4, label="its derivatives, added up")
@@ -165,8 +171,7 @@ def _switches(axes: Axes, folder: Path) -> None:
     axes.legend(fontsize=6, loc="lower center", ncols=2)
 
 
-def draw_before_after(folder: Path, config: ProbePlacementConfig) -> Figure:
-    replay = read_json(folder / "replay.json")
+def draw_before_after(replay: dict[str, Any], config: ProbePlacementConfig) -> Figure:
     runs: list[dict[str, Any]] = replay["runs"]
     figure = Figure(figsize=(11.5, 4.6), layout="constrained")
     grid = figure.subplots(2, 1 + (len(runs) - 1 + 1) // 2, squeeze=False)

@@ -11,52 +11,61 @@ every step, from nothing but its position; what it then does is the solution of 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from experiments.kinds import Track
+from experiments.results import write_rows
 from experiments.runs.config import CaseConfig, CasesConfig
+from experiments.runs.observe import observe
+from experiments.runs.observers import Observers
 from experiments.runs.recording import Recording
+from experiments.runs.saved import Results
+from experiments.runs.table import measure_cases
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.simulation import closed_loop
+
+
+def run_cases(config: CasesConfig, out: Path, track: Track) -> dict[str, Any]:
+    """Simulate and observe; returns the summary."""
+    observers = Observers(config, record_cases(config))
+    observe(observers, out, track)
+    summary = measure_cases(Results(out, config), observers)
+    write_rows(out / "cases.csv", summary["cases"])
+    return summary
 
 
 def record_cases(config: CasesConfig) -> Recording:
     """All cases as one batch of robots, each among its own bodies."""
-    goals = torch.tensor(config.goal, dtype=torch.float64).expand(len(config.cases), 2)
+    count = len(config.cases)
+    goals, start = (torch.tensor(at, dtype=torch.float64).expand(count, 2) for at in (config.goal, config.start))
     controller = CbfQpController(config.task.build([]), [barrier.build([]) for barrier in config.barriers])
+    places = [_places(case, config) for case in config.cases]
+    offsets, radii, present = (torch.stack(parts) for parts in zip(*places, strict=True))
+    radius = torch.full((count,), config.radius, dtype=torch.float64)
+
+    def around(t: float, x: Tensor, _: Tensor) -> Measurement:
+        bodies = x.unsqueeze(-2) + offsets @ _rotation(math.radians(config.spin) * t).T
+        return Measurement(t=t, x=x, u=None, bodies=bodies, present=present, radius=radius, body_radii=radii)
+
+    samples = config.steps + 1
     return Recording(
         robots=[case.name for case in config.cases],
         goals=goals,
         task=controller.task,
         barriers=list(controller.barriers),
         row_names=[str(j + 1) for j in range(_slots(config))],
-        measurements=_measurements(config, controller, goals),
-        samples=config.steps + 1,
+        measurements=(
+            sample.measurement
+            for sample in closed_loop(controller, goals, start, around, dt=config.dt, samples=samples)
+        ),
+        samples=samples,
     )
-
-
-def _measurements(config: CasesConfig, controller: CbfQpController, goals: Tensor) -> Iterator[Measurement]:
-    x = torch.tensor(config.start, dtype=torch.float64).expand(len(config.cases), 2)
-    places = [_places(case, config) for case in config.cases]
-    offsets, radii, present = (torch.stack(parts) for parts in zip(*places, strict=True))
-    for k in range(config.steps + 1):
-        t = k * config.dt
-        measurement = Measurement(
-            t=t,
-            x=x,
-            u=None,
-            bodies=x.unsqueeze(-2) + offsets @ _rotation(math.radians(config.spin) * t).T,
-            present=present,
-            radius=torch.full(goals.shape[:1], config.radius, dtype=torch.float64),
-            body_radii=radii,
-        )
-        u = controller(measurement, goals).u
-        yield replace(measurement, u=u)
-        x = x + config.dt * u
 
 
 def _places(case: CaseConfig, config: CasesConfig) -> tuple[Tensor, Tensor, Tensor]:

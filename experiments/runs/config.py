@@ -6,14 +6,13 @@ Each file is complete: nothing is inherited, and what is left out has the defaul
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
-from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from torchfsid.config.documents import Strict, apply_overrides, read_yaml, validate, wrong
+from torchfsid.config.documents import Strict, wrong
 from torchfsid.config.observe import (
     AvoidanceConfig,
     BarrierConfig,
@@ -23,7 +22,6 @@ from torchfsid.config.observe import (
 )
 from torchfsid.config.quantities import BodyName, NonNegative, Number, PlanarVector, Positive
 from torchfsid.config.tasks import GoalConfig
-from torchfsid.errors import ConfigError
 
 MAX_STEPS = 1_000_000
 """More is a slip of the pen in dt or duration."""
@@ -261,24 +259,6 @@ class SwarmConfig(ExperimentConfig):
         if self.snapshots[-1] > self.duration:
             raise wrong(f"must not be after the end, {self.duration} s, got {self.snapshots[-1]}", "snapshots")
         return self
-
-
-RunConfig = SceneConfig | CasesConfig | SwarmConfig
-
-MODELS: dict[object, type[SceneConfig] | type[CasesConfig] | type[SwarmConfig]] = {
-    "scene": SceneConfig,
-    "cases": CasesConfig,
-    "swarm": SwarmConfig,
-}
-
-
-def load_experiment(path: str | Path, overrides: Iterable[str] = ()) -> RunConfig:
-    """The experiment in a file, after `overrides` such as "noise.velocity=0.02". Raises `ConfigError`."""
-    mapping = apply_overrides(read_yaml(path), overrides)
-    kind = str(mapping.get("kind"))
-    if kind not in MODELS:
-        raise ConfigError(f"{path}: kind: expected one of {', '.join(map(repr, MODELS))}, got {mapping.get('kind')!r}")
-    return validate(mapping, MODELS[kind], source=str(path))
 
 
 def require_increasing(times: Sequence[float], path: str) -> None:

@@ -23,10 +23,12 @@ class Recording:
     """Measurements of a batch of robots, in the order of time.
 
     Attributes:
-        robots: their names. goals: the truth [m].
+        robots: their names.
+        goals: the truth [m].
         task, barriers: the model, which is also what the observers assume.
         row_names: for each row of the barriers, the body that it avoids or the row's label.
-        samples: how many `measurements` there are.
+        measurements: what is seen.
+        samples: how many there are.
     """
 
     robots: list[str]
@@ -39,8 +41,8 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class Scene:
-    """A simulated scene: the true trajectory, and what is measured of it."""
+class SimulatedScene:
+    """A scene that was run: the true trajectory, and what is measured of it."""
 
     config: SceneConfig
     task: Task
@@ -61,7 +63,7 @@ class Scene:
         )
 
 
-def simulate_scene(config: SceneConfig) -> Scene:
+def simulate_scene(config: SceneConfig) -> SimulatedScene:
     """Run the scene's robots in closed loop, and measure them as well as the config says."""
     task = config.task.build(config.bodies)
     barriers: list[Barrier] = [barrier.build(config.bodies) for barrier in config.barriers]
@@ -73,7 +75,7 @@ def simulate_scene(config: SceneConfig) -> Scene:
         steps=config.steps,
         obstacles=_points([obstacle.position for obstacle in config.obstacles]),
     )
-    return Scene(config, task, barriers, true, measure(true, config))
+    return SimulatedScene(config, task, barriers, true, measure(true, config))
 
 
 def _points(points: list[tuple[float, ...]]) -> Float[Tensor, "points 2"]:

@@ -1,11 +1,7 @@
-"""A results folder, read back: all that the summary and the figures are made from. No torch in this module."""
+"""The results folder of a scene or of constructed cases, read back. No torch in this module."""
 
 from __future__ import annotations
 
-import csv
-import json
-from collections import defaultdict
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,15 +9,22 @@ from typing import Any, Literal
 
 import numpy as np
 
-from experiments.runs.config import CasesConfig, SceneConfig, SwarmConfig, load_experiment
+from experiments.results import Columns, damaged, read_columns, read_json, read_lines, reading
+from experiments.runs.config import CasesConfig, SceneConfig
 
 SETS: tuple[Literal["critical_region", "inverse_optimal"], ...] = ("critical_region", "inverse_optimal")
 
 
 @dataclass(frozen=True)
 class Region:
-    """What regions.jsonl says about a robot at one time: names of the active rows, vertices of both sets, and of a
-    constructed case the unit rows (a_x, a_y, b) over the control, the control and the nominal control."""
+    """What regions.jsonl says about a robot at one time.
+
+    Attributes:
+        active: names of the active rows.
+        vertices: of both kinds of set [m].
+        rows: unit rows (a_x, a_y, b) over the control.
+        u, nominal: the control and the nominal one [m/s].
+    """
 
     active: list[str]
     vertices: dict[str, np.ndarray]
@@ -35,12 +38,7 @@ class Results:
     """The folder of a run. Robots come in the order of the config, times increase."""
 
     folder: Path
-
-    @cached_property
-    def config(self) -> SceneConfig | CasesConfig:
-        config = load_experiment(self.folder / "config.yaml")
-        assert not isinstance(config, SwarmConfig)
-        return config
+    config: SceneConfig | CasesConfig
 
     @cached_property
     def robots(self) -> list[str]:
@@ -56,11 +54,11 @@ class Results:
 
     @cached_property
     def t(self) -> np.ndarray:
-        return np.array([float(text) for text in self._table["t"][:, 0]])
+        return self.numbers("t")[:, 0]
 
     def numbers(self, *columns: str) -> np.ndarray:
         """Columns of estimates.csv: (times, robots), or with more than one (times, robots, columns)."""
-        values = np.stack([self._table[column].astype(float) for column in columns], axis=-1)
+        values = np.stack([self._by_robot(self._table.numbers(column)) for column in columns], axis=-1)
         return values[..., 0] if len(columns) == 1 else values
 
     def of_set(self, kind: str, *columns: str) -> np.ndarray:
@@ -74,7 +72,7 @@ class Results:
 
     def cases(self) -> np.ndarray:
         """Letters, (times, robots)."""
-        return self._table["case"]
+        return self._by_robot(self._table["case"])
 
     def n_active(self) -> np.ndarray:
         """(times, robots)"""
@@ -87,41 +85,45 @@ class Results:
     @cached_property
     def regions(self) -> list[list[Region]]:
         """By sample, then robot."""
-        with (self.folder / "regions.jsonl").open(encoding="utf-8") as file:
-            lines = [_region(json.loads(line)) for line in file]
-        return [lines[i : i + len(self.robots)] for i in range(0, len(lines), len(self.robots))]
+        path, count = self.folder / "regions.jsonl", len(self.robots)
+        with reading(path):
+            lines = [_region(line) for line in read_lines(path)]
+        if len(lines) != count * len(self.t):
+            damaged(path, f"it has {len(lines)} lines for {len(self.t)} times and {count} robots")
+        return [lines[i : i + count] for i in range(0, len(lines), count)]
 
     @cached_property
     def paths(self) -> dict[str, np.ndarray]:
         """Of every body: (times, 2) [m]."""
-        paths: dict[str, list] = defaultdict(list)
-        for row in _read_csv(self.folder / "trajectory.csv"):
-            paths[row["robot"]].append((float(row["x"]), float(row["y"])))
-        return {body: np.array(path) for body, path in paths.items()}
+        path = self.folder / "trajectory.csv"
+        assert isinstance(self.config, SceneConfig)
+        table, paths = read_columns(path), {}
+        for body in self.config.bodies:
+            of_body = table.where(robot=body)
+            paths[body] = np.stack([of_body.numbers("x"), of_body.numbers("y")], axis=-1)
+            if len(paths[body]) != len(self.t):
+                damaged(path, f"it has {len(paths[body])} rows of {body!r}, estimates.csv {len(self.t)}")
+        return paths
 
     @cached_property
     def summary(self) -> dict[str, Any]:
-        return json.loads((self.folder / "summary.json").read_text(encoding="utf-8"))
+        return read_json(self.folder / "summary.json")
 
     @cached_property
-    def _table(self) -> dict[str, np.ndarray]:
-        columns: dict[str, list[str]] = defaultdict(list)
-        for row in _read_csv(self.folder / "estimates.csv"):
-            for name, cell in row.items():
-                columns[name].append(cell)
-        return {name: np.array(cells).reshape(-1, len(self.robots)) for name, cells in columns.items()}
+    def _table(self) -> Columns:
+        return read_columns(self.folder / "estimates.csv")
 
-
-def _read_csv(path: Path) -> Iterator[dict[str, str]]:
-    with path.open(newline="", encoding="utf-8") as file:
-        yield from csv.DictReader(file)
+    def _by_robot(self, column: np.ndarray) -> np.ndarray:
+        if len(column) % len(self.robots):
+            damaged(self._table.path, f"it has {len(column)} rows for {len(self.robots)} robots")
+        return column.reshape(-1, len(self.robots))
 
 
 def _region(line: dict[str, Any]) -> Region:
     return Region(
-        active=line["active"],
-        vertices={kind: np.array(line[kind]) for kind in SETS},
-        rows=np.array(line["rows"]).reshape(-1, 3),
-        u=np.array(line["u"]),
-        nominal=np.array(line["nominal"]),
+        active=[str(name) for name in line["active"]],
+        vertices={kind: np.array(line[kind], dtype=float).reshape(-1, 2) for kind in SETS},
+        rows=np.array(line["rows"], dtype=float).reshape(-1, 3),
+        u=np.array(line["u"], dtype=float).reshape(2),
+        nominal=np.array(line["nominal"], dtype=float).reshape(2),
     )

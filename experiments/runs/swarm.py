@@ -4,19 +4,15 @@ Every robot avoids its nearest neighbours within the sensing radius, and the obs
 bodies. It does not count on the robots' ignoring all others: where the row of a body left out might have been active,
 a sample is not used (`torchfsid.neighbours`).
 
-    sizes.csv       over time: quantiles of the square root of the sets' areas, shares of lost and deadlocked robots
-    snapshots.csv   at the snapshots, of every robot: where it is, its goal, the size of its set, the paper's case
-    summary.json    what was lost, how long it took, how much memory at most
+estimates.csv has the robots at the snapshots only: every sample of a thousand robots would be too much to write.
 """
 
 from __future__ import annotations
 
-import csv
 import resource
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,104 +21,53 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
+from experiments.kinds import Track
+from experiments.results import RowWriter
 from experiments.runs.config import SwarmConfig
 from experiments.runs.errors import in_disc
-from torchfsid.commands.results import STATUS_NAMES, write_json
-from torchfsid.config.documents import dump
+from torchfsid.commands.results import STATUS_NAMES, ResultsWriter
 from torchfsid.identification.kkt import CASES
 from torchfsid.observers.set_membership import SetEstimate, SetMembershipObserver
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.neighbours import nearest_bodies
-from torchfsid.robots.simulation import IDLE, STILL
+from torchfsid.robots.simulation import Sample, closed_loop
 from torchfsid.sets.feasible_set import FeasibleSet
 
 QUANTILES = (0.1, 0.5, 0.9, 1.0)
-SIZES = ("t", *(f"sqrt_area_{q:g}" for q in QUANTILES), "lost", "still", "memory_mib")
-SNAPSHOTS = ("t", "robot", "x", "y", "goal_x", "goal_y", "sqrt_area", "case")
 
 
-@dataclass
-class Swarm:
-    """The robots, and what happened to them so far.
-
-    Attributes:
-        starts, goals: [m]. x: where they are [m]. still: they stand though they have somewhere to go.
-        infeasible: steps without a feasible control. closest: the least distance between two robots so far [m].
-    """
-
-    config: SwarmConfig
-    starts: Tensor = field(init=False)
-    goals: Tensor = field(init=False)
-    x: Tensor = field(init=False)
-    still: Tensor = field(init=False)
-    infeasible: int = 0
-    closest: float = float("inf")
-
-    def __post_init__(self) -> None:
-        config = self.config
-        self._placing, self._measuring = map(np.random.default_rng, np.random.SeedSequence(config.seed).spawn(2))
-        cells = np.arange(config.robots)
-        columns = round(config.side / config.spacing)
-        centres = (np.stack([cells % columns, cells // columns], axis=-1) + 0.5) * config.spacing - config.side / 2
-        room = (config.spacing - config.separation) / 2
-        self.starts = torch.from_numpy(centres + self._placing.uniform(-room, room, size=centres.shape))
-        goals = self.starts + in_disc(self._placing, config.travel, (config.robots,))
-        self.goals = goals.clamp(-config.side / 2, config.side / 2)
-        self.x = self.starts
-
-    def measurements(self, controller: CbfQpController) -> Iterator[Measurement]:
-        """Run the robots; what is seen of them, sample by sample."""
-        config = self.config
-        seen_before = u = torch.zeros_like(self.x)
-        for k in range(config.steps + 1):
-            t, among = k * config.dt, {"count": config.neighbours, "within": config.sensing_radius}
-            control = controller(nearest_bodies(t, self.x, previous_u=u, **among), self.goals)
-            u, speed = control.u, control.u.norm(dim=-1)
-            nominal = control.nominal.norm(dim=-1)
-            self.still = (speed <= STILL * nominal) & (nominal > IDLE)
-            self.infeasible += int((~control.feasible).sum())
-            seen = u + in_disc(self._measuring, config.measurement_noise.velocity, (config.robots,))
-            measurement = nearest_bodies(t, self.x, seen, previous_u=seen_before, **among)
-            away = (measurement.bodies - measurement.x.unsqueeze(-2)).norm(dim=-1)
-            self.closest = min(self.closest, float(torch.where(measurement.present, away, torch.inf).min()))
-            yield replace(measurement, observed=control.feasible)
-            self.x, seen_before = self.x + config.dt * u, seen
-
-
-def run_swarm(config: SwarmConfig, out: Path, track: Any) -> dict[str, Any]:
-    """Simulate, observe, and write everything but the figure; returns the summary."""
+def run_swarm(config: SwarmConfig, out: Path, track: Track) -> dict[str, Any]:
+    """Simulate and observe; returns the summary."""
     began = time.perf_counter()
-    swarm = Swarm(config)
+    placing, measuring = map(np.random.default_rng, np.random.SeedSequence(config.seed).spawn(2))
+    starts, goals = place(config, placing)
     controller = CbfQpController(config.task.build([]), [barrier.build([]) for barrier in config.barriers])
-    lower, upper = (
-        torch.tensor(corner).expand(swarm.goals.shape) for corner in (config.prior.lower, config.prior.upper)
-    )
-    observer = SetMembershipObserver(
-        controller.task,
-        controller.barriers,
-        FeasibleSet.from_box(lower, upper),
-        kind=config.set,
-        noise=config.noise.build() if config.set == "inverse_optimal" else None,
-        active_tolerance=config.active_tolerance,
-    )
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "config.yaml").write_text(dump(config), encoding="utf-8")
-    lost = torch.zeros(config.robots, dtype=torch.bool)
+    observer = _observer(config, controller, goals)
+    lost, infeasible, closest = torch.zeros(config.robots, dtype=torch.bool), 0, float("inf")
     shown = {round(t / config.dt) for t in config.snapshots}
-    with _table(out / "sizes.csv", SIZES) as sizes, _table(out / "snapshots.csv", SNAPSHOTS) as snapshots:
-        for k, measurement in enumerate(track(swarm.measurements(controller), config.steps + 1)):
+    loop, total = measurements(config, controller, starts, goals, measuring), config.steps + 1
+    with (
+        ResultsWriter(out, [str(i) for i in range(config.robots)], observer) as estimates,
+        RowWriter(out / "sizes.csv") as sizes,
+        RowWriter(out / "snapshots.csv") as snapshots,
+    ):
+        for k, (measurement, sample) in enumerate(track(loop, "Observing", total)):
             estimate = observer.update(measurement)
-            lost |= ~estimate.feasible_set.contains(swarm.goals)
+            lost |= ~estimate.feasible_set.contains(goals)
+            infeasible += int((~sample.control.feasible).sum())
+            away = (measurement.bodies - measurement.x.unsqueeze(-2)).norm(dim=-1)
+            closest = min(closest, float(torch.where(measurement.present, away, torch.inf).min()))
             size = estimate.feasible_set.volume().sqrt()
             quantiles = torch.quantile(size, torch.tensor(QUANTILES, dtype=torch.float64)).tolist()
-            shares = float(lost.double().mean()), float(swarm.still.double().mean())
-            sizes(measurement.t, *quantiles, *shares, memory_mib())
+            shares = {"lost": float(lost.double().mean()), "still": float(sample.still.double().mean())}
+            of_sizes = {f"sqrt_area_{q:g}": value for q, value in zip(QUANTILES, quantiles, strict=True)}
+            sizes.write([_rounded({"t": measurement.t, **of_sizes, **shares, "memory_mib": memory_mib()})])
             if k in shown:
-                for row in _snapshot(measurement, estimate, size, swarm.goals):
-                    snapshots(*row)
+                estimates.write(measurement, estimate)
+                snapshots.write(_snapshot(measurement, estimate, size, goals))
     status = observer.status.tolist()
-    summary = {
+    return {
         "title": config.title,
         "robots": config.robots,
         "steps": config.steps,
@@ -130,14 +75,51 @@ def run_swarm(config: SwarmConfig, out: Path, track: Any) -> dict[str, Any]:
         "status": {name: status.count(value) for value, name in STATUS_NAMES.items()},
         "samples_not_used": int(observer.skipped.sum()),
         "sqrt_area": dict(zip(map(str, QUANTILES), quantiles, strict=True)),
-        "still": int(swarm.still.sum()),
-        "infeasible_steps": swarm.infeasible,
-        "closest": swarm.closest,
+        "still": int(sample.still.sum()),
+        "infeasible_steps": infeasible,
+        "closest": closest,
         "seconds": round(time.perf_counter() - began, 1),
         "peak_memory_mib": memory_mib(),
     }
-    write_json(out / "summary.json", summary)
-    return summary
+
+
+def place(config: SwarmConfig, random: np.random.Generator) -> tuple[Tensor, Tensor]:
+    """Starts, each in its own cell of a grid, and goals [m]."""
+    cells = np.arange(config.robots)
+    columns = round(config.side / config.spacing)
+    centres = (np.stack([cells % columns, cells // columns], axis=-1) + 0.5) * config.spacing - config.side / 2
+    room = (config.spacing - config.separation) / 2
+    starts = torch.from_numpy(centres + random.uniform(-room, room, size=centres.shape))
+    goals = starts + in_disc(random, config.travel, (config.robots,))
+    return starts, goals.clamp(-config.side / 2, config.side / 2)
+
+
+def measurements(
+    config: SwarmConfig, controller: CbfQpController, starts: Tensor, goals: Tensor, random: np.random.Generator
+) -> Iterator[tuple[Measurement, Sample]]:
+    """Run the robots: sample by sample what is seen of them, and what they did."""
+
+    def among_nearest(t: float, x: Tensor, previous_u: Tensor, u: Tensor | None = None) -> Measurement:
+        return nearest_bodies(t, x, u, previous_u=previous_u, count=config.neighbours, within=config.sensing_radius)
+
+    before = torch.zeros_like(starts)
+    for sample in closed_loop(controller, goals, starts, among_nearest, dt=config.dt, samples=config.steps + 1):
+        seen = sample.control.u + in_disc(random, config.measurement_noise.velocity, (config.robots,))
+        measurement = among_nearest(sample.measurement.t, sample.measurement.x, before, seen)
+        yield replace(measurement, observed=sample.control.feasible), sample
+        before = seen
+
+
+def _observer(config: SwarmConfig, controller: CbfQpController, goals: Tensor) -> SetMembershipObserver:
+    corners = (torch.tensor(corner).expand(goals.shape) for corner in (config.prior.lower, config.prior.upper))
+    return SetMembershipObserver(
+        controller.task,
+        controller.barriers,
+        FeasibleSet.from_box(*corners),
+        kind=config.set,
+        noise=config.noise.build() if config.set == "inverse_optimal" else None,
+        active_tolerance=config.active_tolerance,
+    )
 
 
 def memory_mib() -> float:
@@ -145,19 +127,17 @@ def memory_mib() -> float:
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)
 
 
-@contextmanager
-def _table(path: Path, header: Sequence[str]) -> Iterator[Callable[..., None]]:
-    """Call it with the cells of a row."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(header)
-        yield lambda *cells: writer.writerow([f"{cell:.6g}" if isinstance(cell, float) else cell for cell in cells])
-
-
-def _snapshot(measurement: Measurement, estimate: SetEstimate, size: Tensor, goals: Tensor) -> Iterator[list[Any]]:
+def _snapshot(measurement: Measurement, estimate: SetEstimate, size: Tensor, goals: Tensor) -> Iterator[dict[str, Any]]:
+    columns = "x", "y", "goal_x", "goal_y", "sqrt_area"
     places = torch.cat([measurement.x, goals, size.unsqueeze(-1)], dim=-1).tolist()
     for i, (place, case) in enumerate(zip(places, estimate.kkt.case.tolist(), strict=True)):
-        yield [measurement.t, i, *place, CASES[case]]
+        numbers = dict(zip(columns, place, strict=True))
+        yield _rounded({"t": measurement.t, "robot": i, **numbers, "case": CASES[case]})
+
+
+def _rounded(row: dict[str, Any]) -> dict[str, Any]:
+    """Six digits, for people and figures."""
+    return {name: f"{value:.6g}" if isinstance(value, float) else value for name, value in row.items()}
 
 
 def print_swarm(summary: dict[str, Any], console: Console) -> None:

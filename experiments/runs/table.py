@@ -11,14 +11,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.table import Table
 
 from experiments.runs.config import CasesConfig
 from experiments.runs.observers import Observers
 from experiments.runs.saved import SETS, Results
 from experiments.runs.summary import settings
+from experiments.tables import table
 
 LEARNED = 0.1
 """Share of the prior's standard deviation."""
@@ -91,16 +90,13 @@ def _measure(i: int, results: Results, observers: Observers) -> dict[str, Any]:
     }
 
 
-def print_table(summary: dict[str, Any], console: Console) -> None:
+def print_cases(summary: dict[str, Any], console: Console) -> None:
     """The measured table, for people; an answer that is not the paper's stands in red, with the paper's in brackets."""
     title = f"{summary['title']}: {summary['steps']} samples of {summary['settings']['dt']} s"
-    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1))
-    for heading in ("case", "rank of\nΣG'G dt", "UKF error\n\\[m]", "point\nestimate?"):
-        table.add_column(heading)
-    for heading in ("region's\narea \\[m²]", "steps it\nshrank", "region?", "inv.-opt.\narea \\[m²]"):
-        table.add_column(heading)
+    headings = "case", "rank of\nΣG'G dt", "UKF error\n\\[m]", "point\nestimate?", "region's\narea \\[m²]"
+    shown = table((*headings, "steps it\nshrank", "region?", "inv.-opt.\narea \\[m²]"), title=title)
     for row in summary["cases"]:
-        table.add_row(
+        shown.add_row(
             row["case"],
             str(row["information_rank"]),
             f"{row['ukf_error_before']:.2g} → {row['ukf_error_after']:.1g}",
@@ -110,7 +106,7 @@ def print_table(summary: dict[str, Any], console: Console) -> None:
             _against(row["region_measured"], row["region_paper"]),
             f"{row['inverse_optimal_area_after']:.2g}",
         )
-    console.print(table)
+    console.print(shown)
 
 
 def _against(measured: str, paper: str) -> str:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.table import Table
+
+from experiments.tables import table
 
 ESTIMATORS = {
     "ukf": "UKF error",
@@ -32,14 +32,12 @@ def print_verdict(summary: dict[str, Any], console: Console) -> None:
         counts = ", ".join(f"{sum(of.values())} ({kind})" for kind, of in summary[counted].items())
         console.print(f"  {promise}: {counts}", highlight=False)
     console.print("From when on lengths are below 10 % / 1 % of the prior's \\[s]:")
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1))
     robots = list(summary["timeline"])
-    for heading in ("", *robots):
-        table.add_column(heading, justify="left" if heading == "" else "right")
+    shown = table([""], robots)
     for name, label in ESTIMATORS.items():
         of_shares = [summary["time_below"][share][name] for share in ("10%", "1%")]
-        table.add_row(label, *(" / ".join(_time(of[robot]) for of in of_shares) for robot in robots))
-    console.print(table)
+        shown.add_row(label, *(" / ".join(_time(of[robot]) for of in of_shares) for robot in robots))
+    console.print(shown)
     for robot in robots:
         if summary["infeasible_steps"][robot]:
             console.print(f"[red]{robot}: {summary['infeasible_steps'][robot]} steps without a feasible control")

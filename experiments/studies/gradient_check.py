@@ -18,7 +18,7 @@ from torch import Tensor
 from experiments.design.config import ProbePlacementConfig
 from experiments.design.probe import Objective, Probing, expectation, slope
 from experiments.design.search import Search
-from experiments.design.tables import Track
+from experiments.kinds import Track
 
 CANDIDATES = 32
 """Placements drawn at a time."""
@@ -66,10 +66,10 @@ def nothing_to_follow(config: ProbePlacementConfig, seed: np.random.SeedSequence
             zero, unsound = [], []
             for part in placements.split(CANDIDATES):
                 leaf = part.requires_grad_()
-                outcome = probing.outcome(leaf, goals)
-                gradient = slope(expectation(outcome.area, "area").sum(), leaf)
+                left = probing.left(leaf, goals)
+                gradient = slope(expectation(left.area, "area").sum(), leaf)
                 zero.append((gradient == 0).flatten(1).all(-1))
-                unsound.append(~outcome.sound)
+                unsound.append(~left.sound)
             shares = {"zero": float(torch.cat(zero).double().mean()), "lost": float(torch.cat(unsound).double().mean())}
             rows.append({"way_points": K, "drawn": drawn, **shares})
     return rows
@@ -81,11 +81,11 @@ def _fit_for_it(search: Search, horizon: int) -> Tensor:
     for _ in range(DRAWS):
         candidates = search.near_path(CANDIDATES)
         with torch.no_grad():
-            area = search.probing.outcome(candidates, search.goals, horizon).area
+            area = search.probing.left(candidates, search.goals, horizon).area
             good = (area < MATTERS * search.probing.prior_area).any(-1)
             for step in _steps(candidates, CLEAR * settings.step):
                 for moved in (candidates + step, candidates - step):
-                    good &= search.probing.outcome(moved, search.goals, horizon).sound.all(-1)
+                    good &= search.probing.left(moved, search.goals, horizon).sound.all(-1)
         fit.append(candidates[good])
         if sum(map(len, fit)) >= settings.placements:
             break
@@ -113,11 +113,11 @@ def _check(probing: Probing, placements: Tensor, goals: Tensor, horizon: int) ->
 def _gradients(probing: Probing, placement: Tensor, goals: Tensor, horizon: int) -> dict[Objective, _Gradients]:
     step = probing.config.gradient_check.step
     leaf = placement.clone().requires_grad_()
-    area = probing.outcome(leaf, goals, horizon).area
+    area = probing.left(leaf, goals, horizon).area
     differences: dict[Objective, Tensor] = {objective: torch.zeros_like(placement) for objective in OBJECTIVES}
     for direction in _steps(placement, step):
         with torch.no_grad():
-            ahead, behind = (probing.outcome(at, goals, horizon).area for at in (leaf + direction, leaf - direction))
+            ahead, behind = (probing.left(at, goals, horizon).area for at in (leaf + direction, leaf - direction))
             for objective, of in differences.items():
                 of += (expectation(ahead, objective) - expectation(behind, objective)) / (2 * step) * direction / step
     found = {}

@@ -29,7 +29,7 @@ def across(probing: Probing, place: Float[Tensor, "2"], goal: Float[Tensor, "2"]
     places[:, 0, 1] += torch.linspace(-REACH, REACH, PLACES, dtype=torch.float64)
     places = places[(probing.allowed(places) == places).flatten(1).all(-1)].requires_grad_()
     goals = goal.unsqueeze(0)
-    log_area = probing.outcome(places, goals).area[:, 0].log()
+    log_area = probing.left(places, goals).area[:, 0].log()
     slopes, y = slope(log_area.sum(), places)[:, 0, 1], places.detach()[:, 0, 1]
     log_area = log_area.detach()
     with torch.no_grad():

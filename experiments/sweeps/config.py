@@ -1,8 +1,8 @@
 """The files of `python -m experiments sweep`: many runs of a scene, over a grid, with random teams.
 
 `experiment` is a scene (`experiments.runs.config`) without what the sweep fills in: `title`, `seed`, `snapshots`, and,
-where a `team` is to be drawn, `robots` and `obstacles`. Every point of the grid is run `repeats` times. Run i draws all that
-is random from child i of one `numpy.random.SeedSequence`: it is the same run in whatever order, on however many
+where a `team` is to be drawn, `robots` and `obstacles`. Every point of the grid is run `repeats` times. Run i draws all
+that is random from child i of one `numpy.random.SeedSequence`: it is the same run in whatever order, on however many
 workers. No torch in this module.
 """
 
@@ -13,7 +13,6 @@ import json
 from collections import ChainMap
 from collections.abc import Iterable
 from functools import cached_property
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -21,7 +20,7 @@ from pydantic import Field, model_validator
 
 from experiments.runs.config import SceneConfig, Text, WholeNumber, require_increasing
 from experiments.teams import TeamConfig
-from torchfsid.config.documents import Strict, apply_overrides, read_yaml, validate, wrong
+from torchfsid.config.documents import Strict, apply_overrides, validate, wrong
 from torchfsid.config.quantities import NonNegative, Number
 from torchfsid.errors import ConfigError
 
@@ -92,6 +91,18 @@ class SweepConfig(Strict):
         random = np.random.default_rng(self._seeds(run)[0])
         return {key: float(random.uniform(low, high)) for key, (low, high) in self.draw.items()}
 
+    def check_runs(self, source: str) -> None:
+        """Raises `ConfigError` if the first run of some point of the grid is not a scene."""
+        for run in range(0, self.runs, self.repeats):
+            try:
+                scene = self.scene(run)
+            except ConfigError as error:
+                raise ConfigError(f"{source}: {error}") from error
+            if self.times[-1] > scene.duration:
+                raise ConfigError(
+                    f"{source}: times: must not be after the end, {scene.duration} s, got {self.times[-1]}"
+                )
+
     def _seeds(self, run: int) -> list[np.random.SeedSequence]:
         """For drawing, for placing the team, for measuring."""
         return np.random.SeedSequence(self.seed, spawn_key=(run,)).spawn(3)
@@ -123,21 +134,23 @@ class _Team(Strict):
     team: TeamConfig
 
 
-def load_sweep(path: str | Path, overrides: Iterable[str] = ()) -> SweepConfig:
-    """The sweep in a file, after `overrides`. The first run of every point of its grid is checked, too.
-
-    Raises:
-        ConfigError: the file, or such a run, is wrong.
-    """
-    config = validate(apply_overrides(read_yaml(path), overrides), SweepConfig, source=str(path))
-    for run in range(0, config.runs, config.repeats):
-        try:
-            scene = config.scene(run)
-        except ConfigError as error:
-            raise ConfigError(f"{path}: {error}") from error
-        if config.times[-1] > scene.duration:
-            raise ConfigError(f"{path}: times: must not be after the end, {scene.duration} s, got {config.times[-1]}")
-    return config
+def override_sweep(mapping: dict[Any, Any], overrides: Iterable[str]) -> dict[Any, Any]:
+    """`apply_overrides` for a sweep: what follows `draw.` or `grid.` is one key, dots and commas included, as in
+    "draw.task.gain=[1, 2]". Raises `ConfigError` as that does."""
+    for override in overrides:
+        path, _, text = override.partition("=")
+        section, dot, joined = path.partition(".")
+        section = section.strip()
+        if not (dot and section in ("draw", "grid") and _keys(joined)[0]):
+            mapping = apply_overrides(mapping, [override])
+            continue
+        value = apply_overrides({}, [f"{section}={text}"])[section]
+        lines = mapping.get(section) or {}
+        if not isinstance(lines, dict):
+            raise ConfigError(f"override {override!r}: {section} is no mapping")
+        same = next((key for key in lines if _keys(str(key)) == _keys(joined)), joined.strip())
+        mapping = {**mapping, section: {**lines, same: value}}
+    return mapping
 
 
 def _keys(joined: str) -> list[str]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -16,7 +15,7 @@ from torch import Tensor
 
 from experiments.runs.config import SceneConfig
 from experiments.runs.observers import Observers
-from experiments.runs.recording import Scene, simulate_scene
+from experiments.runs.recording import SimulatedScene, simulate_scene
 from experiments.runs.saved import SETS
 from torchfsid.identification.active_set import active_set
 from torchfsid.identification.kkt import CASES, solve_kkt
@@ -30,21 +29,8 @@ EXACTLY_ACTIVE = 1e-9
 """Distance to its boundary below which a row of the true controls is active [m/s]: round-off of the controller."""
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """A run.
-
-    Attributes:
-        row: of the table of runs. series: rows per time and robot. seconds: how long it took.
-    """
-
-    row: dict[str, Any]
-    series: list[dict[str, Any]]
-    seconds: float
-
-
-def outcome(scene: SceneConfig, times: tuple[float, ...]) -> Outcome:
-    """Simulate and observe a scene; `times` are rounded to samples."""
+def observed(scene: SceneConfig, times: tuple[float, ...]) -> dict[str, Any]:
+    """Simulate and observe a scene: its `row`, its `series` at the samples nearest to `times`, its `seconds`."""
     torch.set_num_threads(1)  # small tensors: more threads only wait for each other
     began = time.perf_counter()
     simulated = simulate_scene(scene)
@@ -82,10 +68,10 @@ def outcome(scene: SceneConfig, times: tuple[float, ...]) -> Outcome:
     for kind in SETS:
         row |= {f"{kind}_{name}": value for name, value in _of_set(observers, kind, lost_since[kind]).items()}
     row |= {name: _rounded(float(values.median())) for name, values in sizes.items()}
-    return Outcome(row, series, time.perf_counter() - began)
+    return {"row": row, "series": series, "seconds": round(time.perf_counter() - began, 3)}
 
 
-def _true_cases(scene: Scene, exact: Measurement) -> tuple[Tensor, Tensor]:
+def _true_cases(scene: SimulatedScene, exact: Measurement) -> tuple[Tensor, Tensor]:
     """The paper's case of every robot, and the rows that are really active."""
     rows = stack_barriers(scene.barriers, exact)
     active = active_set(rows, _control(exact), EXACTLY_ACTIVE)

@@ -7,22 +7,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.table import Table
 
 from experiments.figures.style import length
 from experiments.runs.saved import SETS
+from experiments.sweeps.config import SweepConfig
 from experiments.sweeps.swept import Swept, short
+from experiments.tables import table
 
 SIZES = ("sqrt_area", "diameter", "centroid_error")
 COUNTS = ("lost_and_inconsistent", "lost_in_silence", "alarm", "inconsistent")
 QUANTILES = (0.1, 0.5, 0.9)
 
 
-def summarise_sweep(folder: Path) -> dict[str, Any]:
+def summarise_sweep(folder: Path, config: SweepConfig) -> dict[str, Any]:
     """The content of summary.json. Sizes are quantiles over the robots at the last of the sweep's times."""
-    swept = Swept(folder)
+    swept = Swept(folder, config)
     levels = itertools.product(*(range(len(axis)) for axis in swept.config.axes))
     return {
         "title": swept.config.title,
@@ -64,18 +64,14 @@ def _quantiles(values: np.ndarray) -> list[float] | None:
 
 def print_sweep(summary: dict[str, Any], console: Console) -> None:
     """Robots whose set lost the truth, and medians at the end, for each point of the grid."""
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1))
-    heads = "runs", "robots", "paper's lost", "silently", "√area", "inv.-opt. lost", "√area", "UKF", "hybrid"
-    for i, head in enumerate([*summary["keys"], *heads]):
-        is_key = i < len(summary["keys"])
-        width = max((len(point["point"][i]) for point in summary["points"]), default=0) if is_key else None
-        table.add_column(head, justify="left" if is_key else "right", min_width=width)
+    numbers = "runs", "robots", "paper's lost", "silently", "√area", "inv.-opt. lost", "√area", "UKF", "hybrid"
+    shown = table(summary["keys"], numbers)
     for point in summary["points"]:
         paper, ours = (point[kind] for kind in SETS)
         counts = point["runs"], point["robots"], paper["lost"], paper["lost_in_silence"]
         cells = [*map(str, counts), _median(paper["sqrt_area"]), str(ours["lost"]), _median(ours["sqrt_area"])]
-        table.add_row(*point["point"], *cells, _median(point["ukf_error"]), _median(point["hybrid_error"]))
-    console.print(table)
+        shown.add_row(*point["point"], *cells, _median(point["ukf_error"]), _median(point["hybrid_error"]))
+    console.print(shown)
     if summary["failed"]:
         console.print(f"[red]{summary['failed']} runs failed: see the column error of runs.csv")
 

@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 
 from experiments.figures.style import length
-from experiments.sweeps.config import SweepConfig, load_sweep
+from experiments.results import Columns, reading
+from experiments.sweeps.config import SweepConfig
 from experiments.sweeps.tables import read_table
+from torchfsid.errors import FigureError
 
 
 @dataclass(frozen=True)
@@ -19,22 +21,26 @@ class Swept:
     """Columns of its tables are those of `experiments.sweeps.record`; runs that failed are left out."""
 
     folder: Path
+    config: SweepConfig
 
     @cached_property
-    def config(self) -> SweepConfig:
-        return load_sweep(self.folder / "config.yaml")
+    def all_runs(self) -> Columns:
+        return read_table(self.folder / "runs.parquet")
 
     @cached_property
-    def runs(self) -> dict[str, np.ndarray]:
-        table = read_table(self.folder / "runs.parquet")
-        return {name: column[table["error"] == ""] for name, column in table.items()}
+    def runs(self) -> Columns:
+        """Raises `FigureError` if not a single run succeeded."""
+        succeeded = self.all_runs.where(error="")
+        if not len(succeeded["run"]):
+            raise FigureError(f"{self.folder}: every run failed, as with: {self.all_runs['error'][0]}")
+        return succeeded
 
     @cached_property
     def failed(self) -> int:
-        return int((read_table(self.folder / "runs.parquet")["error"] != "").sum())
+        return len(self.all_runs["run"]) - len(self.runs["run"])
 
     @cached_property
-    def series(self) -> dict[str, np.ndarray]:
+    def series(self) -> Columns:
         return read_table(self.folder / "series.parquet")
 
     @cached_property
@@ -44,14 +50,11 @@ class Swept:
         points = np.arange(self.config.runs) // self.config.repeats
         return np.stack(np.unravel_index(points, shape), axis=-1) if shape else np.zeros((len(points), 0), dtype=int)
 
-    def chosen(self, table: dict[str, np.ndarray], levels: tuple[int | None, ...]) -> dict[str, np.ndarray]:
-        """Rows of `runs` or `series` at these entries of the first lines of the grid; None: at any."""
-        point = self.point_of[table["run"]]
-        rows = np.ones(len(point), dtype=bool)
-        for axis, level in enumerate(levels):
-            if level is not None:
-                rows &= point[:, axis] == level
-        return {name: column[rows] for name, column in table.items()}
+    def chosen(self, table: Columns, levels: tuple[int, ...]) -> Columns:
+        """Rows of `runs` or `series` at these entries of the first lines of the grid."""
+        with reading(table.path):
+            point = self.point_of[table["run"].astype(int)]
+        return table.rows((point[:, : len(levels)] == levels).all(-1))
 
     def telling(self, axis: int) -> list[str]:
         """The first keys of a line of the grid: as many as tell its entries apart."""

@@ -6,11 +6,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 
+from experiments.results import Columns, reading, whole
 from experiments.sweeps.config import SweepConfig
 
 
@@ -26,16 +26,20 @@ def write_tables(out: Path, config: SweepConfig, records: list[dict[str, Any]]) 
     series = [{"run": record["run"], **row} for record in records for row in record["series"]]
     for name, rows in (("runs", runs), ("series", series)):
         table = _table(rows)
-        _write(out / f"{name}.csv", lambda path, table=table: pyarrow.csv.write_csv(table, path))
-        _write(out / f"{name}.parquet", lambda path, table=table: pyarrow.parquet.write_table(table, path))
+        with whole(out / f"{name}.csv") as path:
+            pyarrow.csv.write_csv(table, path)
+        with whole(out / f"{name}.parquet") as path:
+            pyarrow.parquet.write_table(table, path)
     timings = _table([{"run": record["run"], "seconds": record["seconds"]} for record in records])
-    _write(out / "timings.csv", lambda path: pyarrow.csv.write_csv(timings, path))
+    with whole(out / "timings.csv") as path:
+        pyarrow.csv.write_csv(timings, path)
 
 
-def read_table(path: Path) -> dict[str, np.ndarray]:
+def read_table(path: Path) -> Columns:
     """The columns of a Parquet file; numbers that are missing are NaN."""
-    table = pyarrow.parquet.read_table(path)
-    return {name: table[name].to_numpy() for name in table.column_names}
+    with reading(path):
+        table = pyarrow.parquet.read_table(path)
+        return Columns(path, {name: table[name].to_numpy() for name in table.column_names})
 
 
 def _varied(config: SweepConfig, run: int) -> dict[str, Any]:
@@ -46,7 +50,7 @@ def _varied(config: SweepConfig, run: int) -> dict[str, Any]:
 
 def _table(rows: list[dict[str, Any]]) -> pa.Table:
     """Columns in the order in which they first come; a row may lack some (a run that failed)."""
-    names = list(dict.fromkeys(name for row in rows for name in row))
+    names = dict.fromkeys(["run", *(name for row in rows for name in row)])
     return pa.table({name: _column([row.get(name) for row in rows]) for name in names})
 
 
@@ -57,9 +61,3 @@ def _column(values: list[Any]) -> pa.Array:
     if all(isinstance(value, int | float | None) for value in values):
         return pa.array(values)
     return pa.array([value if isinstance(value, str | None) else json.dumps(value) for value in values])
-
-
-def _write(path: Path, write: Any) -> None:
-    partial = path.with_suffix(path.suffix + ".partial")
-    write(partial)
-    partial.replace(path)
