@@ -18,7 +18,7 @@ from torchfsid import (
     SetMembershipObserver,
     simulate,
 )
-from torchfsid.config.observe import AvoidanceConfig, ClassKConfig
+from torchfsid.config.barriers import AvoidanceConfig, ClassKConfig
 from torchfsid.errors import ConfigError, InputError
 from torchfsid.robots.barriers import AffineBarrier, Arena, ClassK, SpeedPolygon
 from torchfsid.robots.measurement import Measurement

@@ -14,9 +14,10 @@ from torch import Tensor
 
 from experiments.__main__ import main
 from experiments.design.adaptive import AdaptiveObserver, ConstantGain, NetworkGain, RlsGain, Step
-from experiments.design.config import LearnedObserverConfig, load_design
+from experiments.design.config import LearnedObserverConfig
 from experiments.design.learning import learn
 from experiments.design.rollouts import Rollouts, roll_out
+from experiments.kinds import load as load_config
 from torchfsid.halfspaces import Halfspaces
 
 CONFIG = Path(__file__).parents[1] / "configs" / "learned_observer.yaml"
@@ -35,7 +36,7 @@ pytestmark = pytest.mark.usefixtures("unchecked")
 
 
 def load(*overrides: str) -> LearnedObserverConfig:
-    config = load_design(CONFIG, overrides)
+    config = load_config(CONFIG, overrides)
     assert isinstance(config, LearnedObserverConfig)
     return config
 
@@ -124,14 +125,16 @@ def test_gradients_through_the_projection(recording: Rollouts):
 def test_a_run_can_be_repeated_and_is_drawn(tmp_path: Path):
     first, second = tmp_path / "first", tmp_path / "second"
     assert main(["design", str(CONFIG), "--out", str(first), *[word for o in SMALL for word in ("--set", o)]]) == 0
-    config = load_design(first / "config.yaml")
+    config = load_config(first / "config.yaml")
     assert isinstance(config, LearnedObserverConfig)
 
     def silent(items: Iterable[Any], *_: Any) -> Iterable[Any]:
         return items
 
-    learn(config, second, silent)
-    for name in ("runs.csv", "curves.csv", "training.csv", "answers.csv", "gains.json", "summary.json"):
+    second.mkdir()
+    summary = learn(config, second, silent)
+    assert summary == json.loads((first / "summary.json").read_text())
+    for name in ("runs.csv", "curves.csv", "training.csv", "answers.csv", "gains.json"):
         assert (first / name).read_bytes() == (second / name).read_bytes()
     assert (first / "figure.png").stat().st_size > 1000
     table = json.loads((first / "summary.json").read_text())["mean errors by noise [m]"]["0.02"]

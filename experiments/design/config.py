@@ -11,8 +11,9 @@ from pydantic import Field, model_validator
 
 from experiments.runs.config import Text, WholeNumber
 from experiments.teams import TeamConfig
+from torchfsid.config.barriers import AvoidanceConfig
 from torchfsid.config.documents import Strict, wrong
-from torchfsid.config.observe import AvoidanceConfig, UkfConfig
+from torchfsid.config.observers import UkfConfig
 from torchfsid.config.quantities import NonNegative, Number, PlanarVector, Positive
 
 Count = Annotated[int, Field(strict=True, ge=1)]

@@ -35,9 +35,8 @@ class Film:
         strip = Image.new("RGB", (width, height * len(shown)))
         for i, image in enumerate(shown):
             strip.paste(image, (0, i * height))
-        looks = {"dither": Image.Dither.NONE}
-        palette = strip.quantize(self.colours, method=Image.Quantize.FASTOCTREE, **looks)
-        first, *others = [image.quantize(palette=palette, **looks) for image in self.frames]
+        palette = strip.quantize(self.colours, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+        first, *others = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in self.frames]
         durations = [self.frame_ms] * len(others) + [LAST_FRAME_MS]
         first.save(path, save_all=True, append_images=others, duration=durations, loop=0, optimize=True)
 

@@ -33,12 +33,13 @@ def _replay(path: Path) -> dict[str, Any]:
             _points(*(run["way_point_places"] or []))
             for sample in run["samples"]:
                 _points(sample["x"], *sample["vertices"], *([sample["probe"]] if sample["probe"] else []))
-                float(sample["t"]), float(sample["area"]), list(sample["active"])
+                _points([sample["t"], sample["area"]])
+                sample["active"] = list(sample["active"])
     if len({len(run["samples"]) for run in replay["runs"]}) != 1 or not replay["runs"][0]["samples"]:
         damaged(path, "its runs are of different lengths")
     return replay
 
 
 def _points(*points: Any) -> None:
-    """Raises `ValueError` or `TypeError` for what is not a point of the plane."""
+    """Raises `ValueError` or `TypeError` for what is not a pair of numbers."""
     np.array(points, dtype=float).reshape(len(points), 2)

@@ -104,7 +104,7 @@ def _first_corridor(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         return np.array(first["obstacles"], dtype=float).reshape(-1, 2), {name: chosen[name] for name in MARKERS}
 
 
-def _corridor(axes: Axes, obstacles: list[list[float]], config: ProbePlacementConfig) -> None:
+def _corridor(axes: Axes, obstacles: np.ndarray, config: ProbePlacementConfig) -> None:
     for x, y in obstacles:
         axes.add_patch(Circle((x, y), config.safety_distance / 2, fc=INACTIVE, ec="0.4", lw=0.6, zorder=2))
     add_robot(axes, config.start, config.safety_distance / 2, ROBOT)

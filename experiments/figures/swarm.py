@@ -11,10 +11,10 @@ from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
+from experiments.figures.drawing import NO_RADIUS
 from experiments.figures.style import INVERSE_OPTIMAL
 from experiments.results import Columns, read_columns, read_json, reading
 from experiments.runs.config import SwarmConfig
-from torchfsid.config.observe import AvoidanceConfig
 
 COLOURS = "viridis_r"
 
@@ -38,7 +38,7 @@ def draw_swarm(folder: Path, config: SwarmConfig) -> Iterator[tuple[str, Figure]
             np.stack([robots.numbers(f"{p}x")[at], robots.numbers(f"{p}y")[at]], axis=-1) for p in ("", "goal_")
         )
         axes.add_collection(LineCollection(list(np.stack([places, goals], axis=1)), colors="0.85", lw=0.4, zorder=0))
-        width = np.full(at.sum(), _safety_distance(config))
+        width = np.full(at.sum(), config.safety_distance or NO_RADIUS)
         discs = EllipseCollection(
             width, width, np.zeros(at.sum()), units="xy", offsets=places, offset_transform=axes.transData, cmap=COLOURS
         )
@@ -71,7 +71,3 @@ def _draw_sizes(axes: Axes, sizes: Columns) -> None:
     axes.set_title("sizes of the sets", fontweight="bold")
     axes.grid(True)
     axes.legend(loc="lower left")
-
-
-def _safety_distance(config: SwarmConfig) -> float:
-    return next(b.safety_distance for b in config.barriers if isinstance(b, AvoidanceConfig) and b.safety_distance)

@@ -8,20 +8,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from torchfsid.config.barriers import AvoidanceConfig, BarrierConfig
 from torchfsid.config.documents import Strict, wrong
-from torchfsid.config.observe import (
-    AvoidanceConfig,
-    BarrierConfig,
-    NoiseConfig,
-    PriorConfig,
-    UkfConfig,
-)
+from torchfsid.config.observers import NoiseConfig, PriorConfig, UkfConfig
 from torchfsid.config.quantities import BodyName, NonNegative, Number, PlanarVector, Positive
 from torchfsid.config.tasks import GoalConfig
+
+if TYPE_CHECKING:
+    from torchfsid.identification.evidence import SetKind
+    from torchfsid.observers.set_membership import SetMembershipObserver
+    from torchfsid.robots.barriers import Barrier
+    from torchfsid.robots.tasks import Task
 
 MAX_STEPS = 1_000_000
 """More is a slip of the pen in dt or duration."""
@@ -98,6 +99,23 @@ class ExperimentConfig(Strict):
     def steps(self) -> int:
         return round(self.duration / self.dt)
 
+    @property
+    def safety_distance(self) -> float | None:
+        """Of the first barrier that has one [m]: the size in which bodies are drawn."""
+        distances = (getattr(barrier, "safety_distance", None) for barrier in self.barriers)
+        return next((distance for distance in distances if distance is not None), None)
+
+    def build_sets(self, kind: SetKind, task: Task, barriers: Sequence[Barrier], robots: int) -> SetMembershipObserver:
+        """The observer of one kind of set. The critical region knows no bound but its active tolerance: the bound also
+        decides on alarms."""
+        from torchfsid.observers.set_membership import SetMembershipObserver
+
+        noise = self.noise.build() if kind == "inverse_optimal" else None
+        prior = self.prior.build(robots)
+        return SetMembershipObserver(
+            task, barriers, prior, kind=kind, noise=noise, active_tolerance=self.active_tolerance
+        )
+
     @model_validator(mode="after")
     def _fits_the_task(self) -> ExperimentConfig:
         if len(self.prior.lower) != self.task.parameters:
@@ -141,7 +159,7 @@ class SceneConfig(ExperimentConfig):
         for i, robot in enumerate(self.robots):
             self._require_in_prior(robot.goal, f"robots[{i}].goal")
         for i, barrier in enumerate(self.barriers):
-            if isinstance(barrier, AvoidanceConfig) and barrier.margin is not None:
+            if barrier.uses_radius:
                 raise wrong("bodies of a scene have no radius: give safety_distance", f"barriers[{i}].margin")
         require_increasing(self.snapshots, "snapshots")
         if self.snapshots[-1] > self.duration:
@@ -251,9 +269,9 @@ class SwarmConfig(ExperimentConfig):
         if self.measurement_noise.position > 0 or self.measurement_noise.shape != "uniform":
             raise wrong("a swarm knows uniform errors of velocities only", "measurement_noise")
         for i, barrier in enumerate(self.barriers):
-            if isinstance(barrier, AvoidanceConfig) and barrier.neighbour_velocity == "current":
+            if barrier.neighbour_velocity == "current":
                 raise wrong("no joint QP over a swarm: none or previous", f"barriers[{i}].neighbour_velocity")
-            if isinstance(barrier, AvoidanceConfig) and barrier.margin is not None:
+            if barrier.uses_radius:
                 raise wrong("bodies of a swarm have no radius: give safety_distance", f"barriers[{i}].margin")
         require_increasing(self.snapshots, "snapshots")
         if self.snapshots[-1] > self.duration:

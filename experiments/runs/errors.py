@@ -18,11 +18,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from experiments.runs.config import SceneConfig
-from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.robots.barriers import Barrier, stack_barriers
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.simulation import Trajectory
-from torchfsid.sets.feasible_set import FeasibleSet
 
 DIRECTIONS = 8
 
@@ -49,12 +47,8 @@ def _worst(true: Trajectory, config: SceneConfig, random: np.random.Generator) -
     # A length of zero needs no direction.
     turns = torch.cartesian_prod(compass if noise.position else compass[:1], compass if noise.velocity else compass[:1])
     candidates = goals.repeat(len(turns), 1)
-    lower, upper = (
-        torch.tensor(corner).expand(candidates.shape) for corner in (config.prior.lower, config.prior.upper)
-    )
-    observer = SetMembershipObserver(
-        config.task.build(config.bodies), barriers, FeasibleSet.from_box(lower, upper), noise=config.noise.build()
-    )
+    task = config.task.build(config.bodies)
+    observer = config.build_sets("inverse_optimal", task, barriers, len(candidates))
     x, u = true.x.clone(), true.u.clone()
     x[0, :robots] += _on_circle(random, noise.position, (robots,))
     u[0, :robots] += _on_circle(random, noise.velocity, (robots,))

@@ -27,12 +27,11 @@ from experiments.runs.config import SwarmConfig
 from experiments.runs.errors import in_disc
 from torchfsid.commands.results import STATUS_NAMES, ResultsWriter
 from torchfsid.identification.kkt import CASES
-from torchfsid.observers.set_membership import SetEstimate, SetMembershipObserver
+from torchfsid.observers.set_membership import SetEstimate
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.neighbours import nearest_bodies
 from torchfsid.robots.simulation import Sample, closed_loop
-from torchfsid.sets.feasible_set import FeasibleSet
 
 QUANTILES = (0.1, 0.5, 0.9, 1.0)
 
@@ -43,7 +42,7 @@ def run_swarm(config: SwarmConfig, out: Path, track: Track) -> dict[str, Any]:
     placing, measuring = map(np.random.default_rng, np.random.SeedSequence(config.seed).spawn(2))
     starts, goals = place(config, placing)
     controller = CbfQpController(config.task.build([]), [barrier.build([]) for barrier in config.barriers])
-    observer = _observer(config, controller, goals)
+    observer = config.build_sets(config.set, controller.task, controller.barriers, config.robots)
     lost, infeasible, closest = torch.zeros(config.robots, dtype=torch.bool), 0, float("inf")
     shown = {round(t / config.dt) for t in config.snapshots}
     loop, total = measurements(config, controller, starts, goals, measuring), config.steps + 1
@@ -108,18 +107,6 @@ def measurements(
         measurement = among_nearest(sample.measurement.t, sample.measurement.x, before, seen)
         yield replace(measurement, observed=sample.control.feasible), sample
         before = seen
-
-
-def _observer(config: SwarmConfig, controller: CbfQpController, goals: Tensor) -> SetMembershipObserver:
-    corners = (torch.tensor(corner).expand(goals.shape) for corner in (config.prior.lower, config.prior.upper))
-    return SetMembershipObserver(
-        controller.task,
-        controller.barriers,
-        FeasibleSet.from_box(*corners),
-        kind=config.set,
-        noise=config.noise.build() if config.set == "inverse_optimal" else None,
-        active_tolerance=config.active_tolerance,
-    )
 
 
 def memory_mib() -> float:

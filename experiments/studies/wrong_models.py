@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchfsid.commands.scene import AUTO_FACTOR
+from torchfsid.commands.declared_log import AUTO_FACTOR
 from torchfsid.observers.consistency import Consistency
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.outcome import Status

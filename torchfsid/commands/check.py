@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchfsid.commands.declared_log import AUTO_FACTOR, DeclaredLog
 from torchfsid.commands.results import constraint_name
-from torchfsid.commands.scene import AUTO_FACTOR, Scene
 from torchfsid.observers.consistency import Consistency
 from torchfsid.sets.feasible_set import FeasibleSet
 
@@ -167,26 +167,26 @@ class Check:
         }
 
 
-def check(scene: Scene) -> Check:
+def check(declared: DeclaredLog) -> Check:
     """Check a log against the model that is declared for it."""
-    consistency = scene.consistency()
+    consistency = declared.consistency()
     fastest = consistency.fastest
     bounds = consistency.smallest_bounds(fastest)
     enough = bounds.clamp(max=fastest)
     overall = float(enough.max())
-    declared = scene.config.noise.velocity
-    velocity = AUTO_FACTOR * overall if declared == "auto" else declared
+    bound = declared.config.noise.velocity
+    velocity = AUTO_FACTOR * overall if bound == "auto" else bound
 
     shifts = {0: float(bounds.max())}
     for shift in SHIFTS:
-        if len(scene.log.t) > abs(shift) + 1:
-            shifts[shift] = float(scene.shifted(shift).consistency().smallest_bounds(overall).max())
+        if len(declared.log.t) > abs(shift) + 1:
+            shifts[shift] = float(declared.shifted(shift).consistency().smallest_bounds(overall).max())
 
     theta, _ = consistency.sets(enough)
     residuals = consistency.residuals(theta, fastest)
-    faults = _Faults(scene.row_labels, consistency, theta, velocity, residuals)
+    faults = _Faults(declared.row_labels, consistency, theta, velocity, residuals)
     robots = []
-    for i, robot in enumerate(scene.robots):
+    for i, robot in enumerate(declared.robots):
         of_robot = residuals[:, i]
         says = ~of_robot.isnan()
         some = of_robot[says]
@@ -198,13 +198,13 @@ def check(scene: Scene) -> Check:
                 median=_quantile(some, 0.5),
                 p95=_quantile(some, 0.95),
                 worst=_quantile(some, 1.0),
-                worst_time=float(scene.log.t[k]) if len(some) else math.nan,
+                worst_time=float(declared.log.t[k]) if len(some) else math.nan,
                 samples=len(some),
                 contradictions=faults.contradictions(i),
                 violations=faults.violations(i),
             )
         )
-    return Check(tuple(robots), velocity, declared == "auto", fastest, shifts)
+    return Check(tuple(robots), velocity, bound == "auto", fastest, shifts)
 
 
 class _Faults:

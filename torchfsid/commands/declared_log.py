@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
+from copy import copy
 from dataclasses import dataclass, field, replace
-
-import torch
 
 from torchfsid.config.observe import ObserveConfig
 from torchfsid.errors import ConfigError
@@ -24,8 +23,8 @@ not the worst there is, and part of an error may look like another parameter."""
 
 
 @dataclass
-class Scene:
-    """A log and the declared model.
+class DeclaredLog:
+    """A log and the model that its configuration declares.
 
     Attributes:
         log: with differences of its positions for velocities, if the configuration says so, and without gaps (`gaps`).
@@ -48,11 +47,8 @@ class Scene:
             raise ConfigError("task: planar controllers only, but the log has a column z")
         if config.velocity == "logged" and self.log.u is None:
             raise ConfigError("velocity: 'logged', but the log has no velocities vx, vy (use 'differentiated')")
-        margins = [b.margin for b in config.barriers if b.kind == "avoidance" and b.margin is not None]
-        if margins and self.log.radius is None:
-            raise ConfigError("barriers: a margin needs the radii, but the log has none (column radius, bag.radius)")
-        if margins and self.log.radius is not None and min(margins) + sorted(self.log.radius)[0] <= 0:
-            raise ConfigError("barriers: a margin of 0 needs positive radii")
+        for declared in config.barriers:
+            declared.require_radii(None if self.log.radius is None else self.log.radius.tolist())
         if len(self.log.bodies) > 1 and not (self.log.seen.sum(axis=1) > 1).any():
             raise ConfigError(f"{self.log.source}: no two bodies share a time, so none would ever see another")
         if config.velocity == "differentiated":
@@ -61,11 +57,7 @@ class Scene:
         self.robots = config.robots(self.log.bodies)
         self.task = config.task.build(self.log.bodies)
         self.barriers = [barrier.build(self.log.bodies) for barrier in config.barriers]
-        lower, upper = (
-            torch.tensor(bound, dtype=torch.float64).expand(len(self.robots), -1)
-            for bound in (config.prior.lower, config.prior.upper)
-        )
-        self.prior = FeasibleSet.from_box(lower, upper)
+        self.prior = config.prior.build(len(self.robots))
 
     @property
     def row_labels(self) -> list[str]:
@@ -89,8 +81,8 @@ class Scene:
             noise.neighbour_velocity,
         )
 
-    def shifted(self, samples: int) -> Scene:
-        """The scene in which the velocities of a sample are those logged so many samples later."""
+    def shifted(self, samples: int) -> DeclaredLog:
+        """The same in which the velocities of a sample are those logged so many samples later."""
         log, times = self.log, len(self.log.t)
         kept = slice(max(0, -samples), times - max(0, samples))
         moved = slice(max(0, samples), times + min(0, samples))
@@ -107,6 +99,12 @@ class Scene:
             bridged=None if log.bridged is None else log.bridged[kept] | log.bridged[moved],
         )
         return replace(self, config=self.config.model_copy(update={"velocity": "logged"}), log=shifted)
+
+    def with_velocity_bound(self, bound: float) -> DeclaredLog:
+        """The same with another `noise.velocity` [m/s]."""
+        other = copy(self)
+        other.config = self.config.with_velocity_bound(bound)
+        return other
 
     def smallest_bounds(self) -> dict[str, float]:
         """For each robot the smallest velocity bound with which the model explains its motion [m/s]; infinite if none
