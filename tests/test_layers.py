@@ -15,7 +15,6 @@ from torchfsid import ChebyshevCentre, Halfspaces, ProjectOnto
 from torchfsid.errors import InputError
 from torchfsid.outcome import ProgrammeStatus
 
-
 BACKENDS = pytest.mark.parametrize("backend", ["exact", "cvxpylayers"])
 
 

@@ -31,7 +31,6 @@ from torchfsid.sets.body import Clipped
 from torchfsid.sets.polygon import Polygon
 from torchfsid.tolerances import ROUND_OFF
 
-
 BOX = 10.0
 """Half the side of the first box: the size that round-off is measured against."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,15 +19,17 @@ import pytest
 from distributed import LocalCluster
 
 from experiments.__main__ import main
-from experiments.journal import Journal
-from experiments.sweep import sweep
-from experiments.sweep_config import load_sweep
-from experiments.sweep_summary import summarise_sweep
-from experiments.sweep_tables import read_table
+from experiments.kinds import load
+from experiments.sweeps.config import SweepConfig
+from experiments.sweeps.journal import Journal
+from experiments.sweeps.sweep import run_sweep
+from experiments.sweeps.tables import read_table
+from experiments.sweeps.workers import workers
+from torchfsid.commands.results_folder import ResultsFolder
 from torchfsid.errors import ConfigError
 
 ROOT = Path(__file__).parents[1]
-TABLES = ("runs.csv", "runs.parquet", "series.csv", "series.parquet", "config.yaml")
+TABLES = ("runs.csv", "runs.parquet", "series.csv", "series.parquet")
 RUNS = 10
 
 CONFIG = """
@@ -69,12 +72,18 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def uninterrupted(config: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("uninterrupted")
-    sweep(load_sweep(config), out, track=untracked)
+    run_sweep(load_sweep(config), out, untracked)
     return out
 
 
-def untracked(records: Iterable[Any], total: int, finished: int) -> Iterable[Any]:
+def untracked(records: Iterable[Any], *_: Any) -> Iterable[Any]:
     return records
+
+
+def load_sweep(path: Path, *overrides: str) -> SweepConfig:
+    config = load(path, overrides, "sweep")
+    assert isinstance(config, SweepConfig)
+    return config
 
 
 def assert_same_tables(out: Path, other: Path) -> None:
@@ -109,7 +118,7 @@ def test_killed_twice_and_resumed_is_the_uninterrupted_sweep(config: Path, unint
     assert 3 <= finished(tmp_path) < RUNS
     with (tmp_path / "records.jsonl").open("ab") as journal:
         journal.write(b'{"run": 9, "error": "", "row": {"rob')  # a line that a kill has cut
-    sweep(load_sweep(config), tmp_path, track=untracked)
+    run_sweep(load_sweep(config), tmp_path, untracked)
     records = (tmp_path / "records.jsonl").read_bytes().splitlines()
     assert records[:2] == first
     assert sorted(json.loads(line)["run"] for line in records) == list(range(RUNS))
@@ -120,32 +129,54 @@ def test_a_dask_cluster_gives_the_same(config: Path, uninterrupted: Path, tmp_pa
     # Workers in threads, reached over TCP: starting processes would take longer than the sweep.
     local = {"processes": False, "protocol": "tcp://", "dashboard_address": None}
     with LocalCluster(n_workers=2, threads_per_worker=1, **local) as cluster:
-        sweep(load_sweep(config), tmp_path, dask=cluster.scheduler_address, track=untracked)
+        with workers(dask=cluster.scheduler_address) as team:
+            run_sweep(load_sweep(config), tmp_path, untracked, team)
     assert_same_tables(tmp_path, uninterrupted)
 
 
-def test_nothing_is_run_again_and_figures_are_drawn_from_the_tables(config: Path, uninterrupted: Path):
-    before = {path.name: path.read_bytes() for path in uninterrupted.iterdir()}
-    assert main(["sweep", str(config), "--out", str(uninterrupted)]) == 0
-    after = {path.name: path.read_bytes() for path in uninterrupted.iterdir()}
-    assert after.items() >= before.items()
-    assert after.keys() - before.keys() == {"summary.json", "figure.png", "figure.pdf"}
-    (uninterrupted / "figure.png").unlink()
-    assert main(["figures", str(uninterrupted)]) == 0
-    assert {path.name: path.read_bytes() for path in uninterrupted.iterdir()} == after
+def test_nothing_is_run_again_and_figures_are_drawn_from_the_tables(config: Path, uninterrupted: Path, tmp_path: Path):
+    out = tmp_path / "out"
+    out.mkdir()
+    shutil.copy(uninterrupted / "records.jsonl", out)
+    journal = (out / "records.jsonl").read_bytes()
+    assert main(["sweep", str(config), "--out", str(out)]) == 0
+    assert (out / "records.jsonl").read_bytes() == journal
+    assert_same_tables(out, uninterrupted)
+    drawn = {name: (out / name).read_bytes() for name in ("figure.png", "figure.pdf")}
+    for name in drawn:
+        (out / name).unlink()
+    assert main(["figures", str(out)]) == 0
+    assert {name: (out / name).read_bytes() for name in drawn} == drawn
 
 
 def test_other_configs_and_other_processes_are_kept_out(
-    config: Path, uninterrupted: Path, capsys: pytest.CaptureFixture[str]
+    config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    assert main(["sweep", str(config), "--out", str(uninterrupted), "--set", "seed=6"]) == 2
+    out, small = tmp_path / "out", ("--set", "repeats=1")
+    assert main(["sweep", str(config), "--out", str(out), *small]) == 0
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    capsys.readouterr()
+    assert main(["sweep", str(config), "--out", str(out), *small, "--set", "seed=6"]) == 2
     assert "holds another sweep" in capsys.readouterr().err
-    with Journal(uninterrupted / "records.jsonl"):
-        assert main(["sweep", str(config), "--out", str(uninterrupted)]) == 2
-    assert "another sweep is writing" in capsys.readouterr().err
-    assert main(["sweep", str(config), "--out", str(uninterrupted / "new"), "--dask", "nonsense://"]) == 2
+    assert main(["run", str(ROOT / "configs" / "two_pairs.yaml"), "--out", str(out)]) == 2
     assert capsys.readouterr().err.count("\n") == 1
-    assert not (uninterrupted / "new").exists()
+    folder = ResultsFolder(out, None)
+    folder.claim([], resume=True)
+    assert main(["sweep", str(config), "--out", str(out), *small]) == 2
+    assert main(["figures", str(out)]) == 2
+    folder.release()
+    assert capsys.readouterr().err.count("another command is writing there") == 2
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    assert main(["sweep", str(config), "--out", str(tmp_path / "new"), "--dask", "nonsense://"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_sweep_leaves_the_folder_of_a_run_alone(config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "config.yaml").write_text("kind: scene\n", encoding="utf-8")
+    assert main(["sweep", str(config), "--out", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
 
 
 def test_the_journal_keeps_every_whole_line(tmp_path: Path):
@@ -187,12 +218,12 @@ def test_rows_say_what_was_run(config: Path, uninterrupted: Path):
 
 def test_a_failed_run_is_a_row_and_not_the_end(config: Path, tmp_path: Path):
     crowded = "experiment.team={robots: [1, 6], place: [disc], radius: 0.6, separation: 0.6}"
-    sweep(load_sweep(config, [crowded, "seed=2"]), tmp_path, track=untracked)
+    summary = run_sweep(load_sweep(config, crowded, "seed=2"), tmp_path, untracked)
     runs = read_table(tmp_path / "runs.parquet")
     failed = runs["error"] != ""
     assert 0 < failed.sum() < RUNS
     assert all("no room" in error for error in runs["error"][failed])
-    assert summarise_sweep(tmp_path)["failed"] == failed.sum()
+    assert summary["failed"] == failed.sum()
 
 
 # What it refuses ----------------------------------------------------------------------------------------------------

@@ -41,11 +41,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from experiments.design.config import BoxConfig, ProbePlacementConfig
-from experiments.design.rollout import closed_loop
 from torchfsid.observers.set_membership import SetEstimate, SetMembershipObserver
 from torchfsid.outcome import Status
 from torchfsid.robots.bounds import NoiseBound
+from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.simulation import closed_loop
 from torchfsid.robots.tasks import GoalTask
 from torchfsid.sets.feasible_set import FeasibleSet
 
@@ -55,7 +56,7 @@ TOUCHING = 1e-9
 """Round-off allowed in the distance between probe and robot, and of a goal from its set [m]."""
 
 
-class Sample(NamedTuple):
+class Instant(NamedTuple):
     """What is seen of a batch (placements, goals) at a time, what is left of Theta, and whether it counts."""
 
     measurement: Measurement
@@ -63,8 +64,13 @@ class Sample(NamedTuple):
     sound: Bool[Tensor, "B"]
 
 
-class Outcome(NamedTuple):
-    """The area of Theta(T) [m^2], that of Theta_0 where nothing is learned; is the outcome one that counts?"""
+class Left(NamedTuple):
+    """What is left of Theta.
+
+    Attributes:
+        area: of Theta(T) [m^2]; that of Theta_0 where nothing is learned.
+        sound: something may be learned there: it counts.
+    """
 
     area: Float[Tensor, "P S"]
     sound: Bool[Tensor, "P S"]
@@ -119,7 +125,7 @@ class Probing:
 
     def samples(
         self, placements: Float[Tensor, "P K 2"] | None, goals: Float[Tensor, "S 2"], steps: int | None = None
-    ) -> Iterator[Sample]:
+    ) -> Iterator[Instant]:
         """Every placement with every goal, P x S items; without a placement, the goals alone."""
         config, S = self.config, len(goals)
         P, K = (1, 0) if placements is None else placements.shape[:2]
@@ -136,41 +142,36 @@ class Probing:
             active_tolerance=config.active_tolerance,
         )
 
-        def bodies(k: int, _: Tensor) -> Tensor:
-            if placements is None:
-                return standing
-            probe = along(placements, k / max(config.steps - 1, 1))
-            return torch.cat([standing, probe.repeat_interleave(S, dim=0).unsqueeze(1)], dim=1)
+        duration, present = config.dt * max(config.steps - 1, 1), torch.ones(B, len(self.obstacles) + (K > 0)).bool()
 
-        loop = closed_loop(
-            task,
-            barriers,
-            goals.repeat(P, 1),
-            self.start.expand(B, 2),
-            bodies,
-            torch.ones(B, len(self.obstacles) + (K > 0), dtype=torch.bool),
-            dt=config.dt,
-            steps=steps,
-        )
+        def around(t: float, x: Tensor, _: Tensor) -> Measurement:
+            bodies = standing
+            if placements is not None:
+                probe = along(placements, min(t / duration, 1.0))
+                bodies = torch.cat([standing, probe.repeat_interleave(S, dim=0).unsqueeze(1)], dim=1)
+            return Measurement(t=t, x=x, u=None, bodies=bodies, present=present)
+
+        theta, start = goals.repeat(P, 1), self.start.expand(B, 2)
+        loop = closed_loop(CbfQpController(task, barriers), theta, start, around, dt=config.dt, samples=steps)
         sound = torch.ones(B, dtype=torch.bool)
-        for seen in loop:
-            estimate = observer.update(seen.measurement)
-            sound = sound & seen.feasible & (estimate.status == Status.OK)
+        for measurement, control in loop:
+            estimate = observer.update(measurement)
+            sound = sound & control.feasible & (estimate.status == Status.OK)
             if K > 0:
-                apart = (seen.measurement.x - seen.measurement.bodies[:, -1]).detach().norm(dim=-1)
+                apart = (measurement.x - measurement.bodies[:, -1]).detach().norm(dim=-1)
                 sound = sound & (apart >= config.safety_distance - TOUCHING)
-            yield Sample(seen.measurement, estimate, sound)
+            yield Instant(measurement, estimate, sound)
 
-    def outcome(
+    def left(
         self, placements: Float[Tensor, "P K 2"] | None, goals: Float[Tensor, "S 2"], steps: int | None = None
-    ) -> Outcome:
+    ) -> Left:
         """What every placement comes to with every goal, after all samples or the first `steps`."""
         for sample in self.samples(placements, goals, steps):
             last = sample
         theta_set = last.estimate.feasible_set
         sound = last.sound & theta_set.contains(goals.repeat(len(last.sound) // len(goals), 1), TOUCHING)
         area = torch.where(sound, theta_set.volume(), self.prior_area)
-        return Outcome(area.reshape(-1, len(goals)), sound.reshape(-1, len(goals)))
+        return Left(area.reshape(-1, len(goals)), sound.reshape(-1, len(goals)))
 
 
 def along(placements: Float[Tensor, "P K 2"], fraction: float) -> Float[Tensor, "P 2"]:

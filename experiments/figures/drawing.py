@@ -12,18 +12,16 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.patches import Circle, Polygon
 
-from experiments.config import SceneConfig
 from experiments.figures.style import ACTIVE, INACTIVE
-from experiments.saved import Results
-from torchfsid.config.barriers import AvoidanceConfig
+from experiments.runs.config import SceneConfig
+from experiments.runs.saved import Results
 
 NO_RADIUS = 0.1
 """Radius of a disc in a scene without safety distance [m]."""
 
 
 def disc_radius(config: SceneConfig) -> float:
-    distances = [b.safety_distance for b in config.barriers if isinstance(b, AvoidanceConfig) and b.safety_distance]
-    return distances[0] / 2 if distances else NO_RADIUS
+    return NO_RADIUS if config.safety_distance is None else config.safety_distance / 2
 
 
 def map_frame(results: Results, config: SceneConfig, aspect: float) -> tuple[np.ndarray, np.ndarray]:

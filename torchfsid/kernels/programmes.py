@@ -27,7 +27,10 @@ from torchfsid.tolerances import ROUND_OFF, VERIFIED
 OK, EMPTY, UNBOUNDED = int(ProgrammeStatus.OK), int(ProgrammeStatus.EMPTY), int(ProgrammeStatus.UNBOUNDED)
 DEGENERATE, UNDEFINED = int(ProgrammeStatus.DEGENERATE), int(ProgrammeStatus.UNDEFINED)
 UNSOLVED = int(ProgrammeStatus.UNSOLVED)
-IMPOSSIBLE, BOUNDLESS = -1, -2  # EMPTY by a row 0.z <= b < 0, and UNBOUNDED for want of a largest ball: no finite radius
+IMPOSSIBLE, BOUNDLESS = (
+    -1,
+    -2,
+)  # EMPTY by a row 0.z <= b < 0, and UNBOUNDED for want of a largest ball: no finite radius
 
 
 @item
@@ -368,7 +371,12 @@ def inscribed_ball(A, b, simplex, centre, radius, rows, status):
     """Fills the last four."""
     B, m, p = A.shape
     unit, offsets, sizes, lengths = np.ones((m, p + 1)), np.empty(m), np.empty(m), np.empty((m, 2))
-    M, V, work, able = np.zeros((p + 1, p + 1)), np.zeros((p + 1, p + 1)), np.zeros((4, p + 1)), np.zeros(p + 1, np.bool_)
+    M, V, work, able = (
+        np.zeros((p + 1, p + 1)),
+        np.zeros((p + 1, p + 1)),
+        np.zeros((4, p + 1)),
+        np.zeros(p + 1, np.bool_),
+    )
     origin, L = np.zeros(p), np.zeros((p, p))
     Q, D, R, scratch = np.zeros((p + 1, p + 1)), np.zeros(p + 1), np.zeros((p + 1, p + 1)), np.zeros((6, p + 1))
     w, far = work[2], work[3]

@@ -91,9 +91,7 @@ class _Measure(torch.autograd.Function):
         return volume, centroid
 
     @staticmethod
-    def backward(
-        ctx: Any, grad_volume: Tensor, grad_centroid: Tensor
-    ) -> tuple[Tensor, Tensor, None, None, None]:
+    def backward(ctx: Any, grad_volume: Tensor, grad_centroid: Tensor) -> tuple[Tensor, Tensor, None, None, None]:
         A, b, volume, centroid = ctx.saved_tensors
         skeleton, p = ctx.skeleton, A.shape[-1]
         # With gradients enabled, second derivatives are wanted.

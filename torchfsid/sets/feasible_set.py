@@ -301,9 +301,13 @@ class FeasibleSet:
     def _check(self, name: str, value: Tensor, shape: tuple[int, ...], broadcast: bool = False) -> None:
         """Is this one item of a shape for each set, or, with `broadcast`, several?"""
         batch, inner = value.shape[: value.ndim - len(shape)], tuple(value.shape[value.ndim - len(shape) :])
-        fits = inner == shape and _fits(batch[max(0, len(batch) - len(self.batch_shape)) if broadcast else 0 :], self.batch_shape)
+        fits = inner == shape and _fits(
+            batch[max(0, len(batch) - len(self.batch_shape)) if broadcast else 0 :], self.batch_shape
+        )
         if not fits:
-            raise InputError(name, f"(*batch, {', '.join(map(str, shape))}), batch {tuple(self.batch_shape)}", tuple(value.shape))
+            raise InputError(
+                name, f"(*batch, {', '.join(map(str, shape))}), batch {tuple(self.batch_shape)}", tuple(value.shape)
+            )
 
     def _flat(self, rows: Tensor, shape: tuple[int, ...]) -> Tensor:
         """One item of this shape for each set, the batch flattened."""
