@@ -73,11 +73,6 @@ class Polytope:
         """Slots that hold a facet."""
         return torch.arange(self.A.shape[1], device=self.count.device) < self.count.unsqueeze(-1)
 
-    @property
-    def reach(self) -> Float[Tensor, "B p"]:
-        """The largest |coordinates| of the vertices."""
-        return self.corners.abs().amax(1)
-
     def rows(self) -> tuple[Float[Tensor, "B F p"], Float[Tensor, "B F"]]:
         """The facets' rows; each carries its gradient."""
         return self.A, self.b
