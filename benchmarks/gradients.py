@@ -2,9 +2,10 @@
 
 What a gradient through Theta costs, and whether it is right.
 
-clips: the mean over B sets of log(area) after 20 clips of 16 rows, and its gradient with respect to all rows. A goal uniform in [-5, 5]^2, the prior [-10, 10]^2, rows of random directions at distances
-(0.2 .. 1) 10 0.9^k from the goal. torchfsid (compiled clips, then implicit derivatives) against the same clips with every
-step in torch (tests/reference_clip.py). Times are CPU times of one thread for value and gradient, the fastest of some
+clips: the mean over B sets of log(area) after 20 clips of 16 rows, and its gradient with respect to all rows. A goal
+uniform in [-5, 5]^2, the prior [-10, 10]^2, rows of random directions at distances (0.2 .. 1) 10 0.9^k from the goal.
+torchfsid (compiled clips, then implicit derivatives) against the same clips with every step in torch
+(tests/reference_clip.py). Times are CPU times of one thread for value and gradient, the fastest of some
 repetitions. Errors are those of the derivative along a random direction, relative to the gradient's norm, against
 central differences.
 """

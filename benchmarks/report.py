@@ -150,8 +150,8 @@ def gradients(found: dict[str, Any]) -> str:
     return "\n".join(
         [
             "## gradients: through the clips of a set\n",
-            "The mean of log(area) after 20 clips of 16 rows and its gradient with respect to all rows; CPU time of one",
-            "thread. `torch`: the same clips with every step differentiated (the tests' reference). Errors of the",
+            "The mean of log(area) after 20 clips of 16 rows and its gradient with respect to all rows; CPU time of",
+            "one thread. `torch`: the same clips with every step differentiated (the tests' reference). Errors of the",
             "derivative along a random direction, relative to the gradient's norm, against central differences.\n",
             table(["B", "ms", "torch, ms", "ratio", "error", "torch, error"], body),
         ]
@@ -160,7 +160,13 @@ def gradients(found: dict[str, Any]) -> str:
 
 def page() -> str:
     parts = [HEAD]
-    for name, part in (("geometry", geometry), ("fleet", fleet), ("observer", observer), ("layers", layers), ("gradients", gradients)):
+    for name, part in (
+        ("geometry", geometry),
+        ("fleet", fleet),
+        ("observer", observer),
+        ("layers", layers),
+        ("gradients", gradients),
+    ):
         if (RESULTS / f"{name}.json").exists():
             saved = load(name)
             versions = ", ".join(f"{package} {version}" for package, version in saved["versions"].items())

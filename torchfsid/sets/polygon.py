@@ -276,7 +276,9 @@ class Polygon:
 def independent(v: Float[Tensor, "*B 2"], w: Float[Tensor, "*B 2"]) -> Bool[Tensor, "*B"]:
     """Do two lines with these normals meet in a point?"""
     v, w = v.detach(), w.detach()
-    return cross(v, w).abs() > PARALLEL_EDGES * torch.linalg.vector_norm(v, dim=-1) * torch.linalg.vector_norm(w, dim=-1)
+    return cross(v, w).abs() > PARALLEL_EDGES * torch.linalg.vector_norm(v, dim=-1) * torch.linalg.vector_norm(
+        w, dim=-1
+    )
 
 
 def cross(v: Tensor, w: Tensor) -> Tensor:

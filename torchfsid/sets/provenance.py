@@ -26,7 +26,7 @@ class Sheets:
         rows: how many rows there are in all of them.
     """
 
-    sheets: tuple[tuple[Float[Tensor, "N p"], Float[Tensor, "N"]], ...] = ()
+    sheets: tuple[tuple[Tensor, Tensor], ...] = ()
     rows: int = 0
 
     def with_sheet(self, A: Float[Tensor, "N p"], b: Float[Tensor, "N"]) -> Sheets:
@@ -76,9 +76,8 @@ class Sheets:
         """The facets' rows, numbers without gradients, with the gradients of the rows that they are labelled by."""
         if not self.sheets:
             return A, b
-        # Zero, with a gradient: a facet that was moved outward keeps its place.
-        zeros = [(rows - rows.detach(), right - right.detach()) for rows, right in self.sheets]
-        of_A = torch.cat([A.new_zeros(1, A.shape[-1]), *(rows for rows, _ in zeros)])
-        of_b = torch.cat([b.new_zeros(1), *(right for _, right in zeros)])
-        index = label.flatten()
-        return A + of_A.index_select(0, index).reshape(A.shape), b + of_b.index_select(0, index).reshape(b.shape)
+        of_A = torch.cat([A.new_zeros(1, A.shape[-1]), *(rows for rows, _ in self.sheets)])
+        of_b = torch.cat([b.new_zeros(1), *(right for _, right in self.sheets)])
+        of_A, of_b = (part.index_select(0, label.flatten()).unflatten(0, label.shape) for part in (of_A, of_b))
+        # Zeros with gradients are added: a facet that was moved outward keeps its place.
+        return A + (of_A - of_A.detach()), b + (of_b - of_b.detach())
