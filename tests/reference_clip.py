@@ -1,7 +1,7 @@
-r"""Polygons cut in torch, every step differentiable: a second opinion on the compiled clip and its implicit derivatives.
+r"""Polygons cut in torch, every step differentiable: a second opinion on the compiled clip and its derivatives.
 
-The rows cut one after the other, of each polygon the deepest first. A row a.z <= c that really cuts a ring keeps one arc
-of it, around the vertex deepest inside, closed by the points where the ring crosses the line:
+The rows cut one after the other, of each polygon the deepest first. A row a.z <= c that really cuts a ring keeps one
+arc of it, around the vertex deepest inside, closed by the points where the ring crosses the line:
 
     kept: a.v - c <= tolerance;    a crossing, from v kept to w lost:  v + s_v/(s_v - s_w) (w - v),   s = a.z - c
 

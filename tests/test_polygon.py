@@ -3,7 +3,6 @@
 A row's exact counterpart is the very rationals that its floats are: what differs is the library's rounding, only.
 """
 
-import itertools
 import math
 from collections import Counter
 from fractions import Fraction
@@ -22,6 +21,7 @@ from tests.problems import (
     exact_area,
     exact_box,
     exact_centroid,
+    exact_inscribed_radius,
     exact_intersection,
     exactly_feasible,
     solve_qp,
@@ -203,26 +203,13 @@ def test_chebyshev_disc_is_that_of_a_linear_programme():
 
 @pytest.mark.parametrize("width", [1.0, 1e-3, 1e-6, 1e-9])
 def test_chebyshev_radius_of_thin_sets_is_exact(width: float):
-    """In rationals, by duality: the least lambda.b over triples with lambda >= 0, sum lambda (a, |a|) = (0, 1)."""
     rng = np.random.default_rng(12)
     polygon = cut(boxes(20), *rows_around(rng, rng.uniform(-5, 5, (20, 2)), 6, width, needle=True)).body
     radius = polygon.chebyshev()[1]
     for i in range(20):
         n = int(polygon.count[i])
-        rows = [(*exact(row), Fraction(float(torch.linalg.vector_norm(row)))) for row in polygon.A[i, :n]]
-        triples = itertools.combinations(zip(rows, exact(polygon.b[i, :n]), strict=True), 3)
-        bounds = [bound for bound in map(inscribed_bound, triples) if bound is not None]
-        assert float(radius[i]) == pytest.approx(float(min(bounds)), abs=4 * ROUND_OFF * BOX)
-
-
-def inscribed_bound(triple: tuple) -> Fraction | None:
-    """lambda.b of three rows (a, |a|), or None if there is no such lambda >= 0."""
-    ((p, q, u), b1), ((r, s, v), b2), ((x, y, w), b3) = triple
-    weights = (r * y - s * x, x * q - y * p, p * s - q * r)  # orthogonal to both columns of the three a
-    total = weights[0] * u + weights[1] * v + weights[2] * w
-    if total == 0 or any(weight / total < 0 for weight in weights):
-        return None
-    return (weights[0] * b1 + weights[1] * b2 + weights[2] * b3) / total
+        expected = exact_inscribed_radius(polygon.A[i, :n].numpy(), polygon.b[i, :n].numpy())
+        assert float(radius[i]) == pytest.approx(expected, abs=4 * ROUND_OFF * BOX)
 
 
 @pytest.mark.parametrize("euclidean", [True, False], ids=["euclidean", "metric"])

@@ -1,4 +1,4 @@
-r"""The point of a polygon nearest to a given one in the norm sqrt(z' H z), and its active rows, one polygon at a time."""
+r"""The nearest point of a polygon in the norm sqrt(z' H z), and its active rows: one polygon at a time."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def foot_on(vertices, A, b, n, x, y, metric):
 @launcher
 @no_type_check
 def feet(vertices, A, b, count, point, metric):
-    """Of each polygon the point nearest to `point` (B, 2) in the norm of `metric` (B, 2, 2), and two active rows (B, 2).
+    """Of each polygon the one nearest to `point` (B, 2) in the norm of `metric` (B, 2, 2), and its active rows (B, 2).
 
     No row: the point itself; one: the foot on an edge; two: a vertex. Rows that are not there are -1.
     """

@@ -70,9 +70,9 @@ class Cell:
     @property
     def content(self) -> float:
         """The volume; of a flat cell, a multiple of round-off."""
-        count = np.array(len(self.vertices))
-        batch = Shape(*(field[None] for field in (self.A, self.b, self.vertices, count, self.incident, self.reach)))
-        return float(batch.content[0])
+        count = np.array([len(self.vertices)])
+        shape = Shape(self.A[None], self.b[None], self.vertices[None], count, self.incident[None], self.reach[None])
+        return float(shape.content[0])
 
     def round_off(self, A: Reals, b: Reals) -> Reals:
         """Round-off of A z - b over the cell."""
@@ -228,12 +228,12 @@ def _without_cheapest_facet(cell: Cell) -> tuple[Cell, Indices] | None:
     return replace(larger.cell, reach=reach), np.flatnonzero(others)[larger.origin]
 
 
-def _nearby(cell: Cell, A: Reals, b: Reals, reach: float) -> Intersection:
-    """{z : A z <= b} in a box around a cell, `reach` times as large; from it come the facets of origin len(A) on."""
+def _nearby(cell: Cell, A: Reals, b: Reals, times: float) -> Intersection:
+    """{z : A z <= b} in a box around a cell, `times` as large; from it come the facets of origin len(A) on."""
     frame = cell.frame
     middle, axes = frame.middle[0], frame.axes[0]
     # Its sides are beyond those of the cell by more than their round-off, or the rows would not cut it.
-    half = np.abs((cell.vertices - middle) @ axes.T).max(0) * reach + 16 * ROUND_OFF * cell.reach.sum()
+    half = np.abs((cell.vertices - middle) @ axes.T).max(0) * times + 16 * ROUND_OFF * cell.reach.sum()
     own = Cell.box(-half, half)
     vertices = middle + own.vertices @ axes
     reach = np.maximum(cell.reach, np.abs(vertices).max(0))

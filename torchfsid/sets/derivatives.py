@@ -11,8 +11,8 @@ Volume V and centroid c change by what the facets sweep,
 
     dV = sum_f int_f (db_f - z.dA_f) dS / |A_f|,     dc = sum_f int_f (z - c) (db_f - z.dA_f) dS / (|A_f| V),
 
-integrals over the simplices that fill a facet. Their first derivatives do not depend on how a vertex is written, and are
-right also where more than p facets meet in one. The second ones are those of the vertices' equations.
+integrals over the simplices that fill a facet. Their first derivatives do not depend on how a vertex is written, and
+are right also where more than p facets meet in one. The second ones are those of the vertices' equations.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def inscribed_ball(
     rows: Int[Tensor, "B p+1"],
     solved: Bool[Tensor, "B"],
 ) -> tuple[Float[Tensor, "B p"], Float[Tensor, "B"]]:
-    """Centre and radius as functions of the p + 1 facets `rows` that decide them; constant where they are not `solved`."""
+    """Centre and radius as functions of the p + 1 facets `rows` that decide them; constant unless they are `solved`."""
     N, ball = at(A, rows), torch.cat([centre, radius.unsqueeze(-1)], dim=-1)
     M = torch.cat([N, torch.linalg.vector_norm(N, dim=-1, keepdim=True)], dim=-1)
     ball = solution(ball, M, at(b, rows), solved)

@@ -11,7 +11,7 @@ facet are padding. Vertices are numbered through the batch, vertex v of item i b
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +56,8 @@ def _pyramids(y: Reals, incident: Mask) -> tuple[Reals, Reals, Reals]:
     (B, _, F), p = incident.shape, y.shape[2]
     levels, base = _descent(incident, p)
     y, areas = y.reshape(-1, p), np.zeros(B * F)
-    volume, centre, plane = np.ones(len(base)), y[base], np.zeros((len(base), 0, p))
+    volume: Reals = np.ones(len(base))
+    centre, plane = y[base], np.zeros((len(base), 0, p))
     for k, (apex, parent, child, facet) in enumerate(reversed(levels), start=1):
         if k == p:
             areas[facet] = volume[child]
@@ -64,7 +65,7 @@ def _pyramids(y: Reals, incident: Mask) -> tuple[Reals, Reals, Reals]:
         height = height - ((flat @ height[..., None]).transpose(0, 2, 1) @ flat)[:, 0]
         length = np.linalg.norm(height, axis=1)
         pyramid = length * volume[child] / k
-        volume = np.bincount(parent, pyramid, len(apex))
+        volume = np.asarray(np.bincount(parent, pyramid, len(apex)), dtype=float)
         share = pyramid / np.where(volume > 0, volume, 1.0)[parent] * k / (k + 1)
         arms = share[:, None] * (centre[child] - y[apex[parent]])
         centre = y[apex] + np.stack([np.bincount(parent, arm, len(apex)) for arm in arms.T], axis=1)
@@ -132,8 +133,9 @@ def _parts(incident: Mask, p: int) -> list[slice]:
 def _descent(incident: Mask, p: int) -> tuple[list[Level], Indices]:
     """From the polytopes down to their edges, level by level; below them the vertices."""
     B, V, F = incident.shape
-    on, faces, owner = incident.astype(np.float32), incident.any(2), np.arange(B)
-    levels: list[Any] = []
+    on, owner = incident.astype(np.float32), np.arange(B)
+    faces: Mask = np.asarray(incident.any(2))
+    levels: list[Level] = []
     for k in range(p, 0, -1):
         apex = faces.argmax(1)
         is_side = (faces.astype(np.float32)[:, None] @ on[owner])[:, 0] >= k

@@ -3,10 +3,10 @@ r"""The feasible set Theta(t): where the parameter must lie, given everything se
     Theta(t) = Theta_0  intersected with all  Omega(tau), tau <= t          Theta_0 a box, the prior
 
 A set is a value: `intersect` returns the next one. In the plane it is a batch of polygons, elsewhere a batch of
-polytopes; both are differentiable. Its promises, up to round-off: it contains the truth if all half-spaces do; its volume
-never grows; it stays bounded; the order of the half-spaces does not matter, and a smaller bound never gives a larger set;
-it takes the memory of its facets, of which there are at most `max_facets`, merged outward. Each facet remembers when and
-from which constraint it came.
+polytopes; both are differentiable. Its promises, up to round-off: it contains the truth if all half-spaces do; its
+volume never grows; it stays bounded; the order of the half-spaces does not matter, and a smaller bound never gives a
+larger set; it takes the memory of its facets, of which there are at most `max_facets`, merged outward. Each facet
+remembers when and from which constraint it came.
 
 An EMPTY item says so whatever it is asked: it has volume 0 and contains nothing; its centroid, vertices, diameter,
 support, Chebyshev centre and nearest points are NaN; its radius is minus the depth of the contradiction, the least
@@ -86,8 +86,8 @@ class FeasibleSet:
         """The prior Theta_0 = [lower, upper].
 
         Raises:
-            InputError: shapes differ, or lower < upper fails somewhere, or the box is not bounded, or `max_facets` cannot
-                bound a set.
+            InputError: shapes differ, or lower < upper fails somewhere, or the box is not bounded, or `max_facets`
+                cannot bound a set.
         """
         lower, upper = torch.as_tensor(lower).to(torch.float64), torch.as_tensor(upper).to(torch.float64)
         if lower.shape != upper.shape or lower.ndim == 0:
@@ -160,17 +160,20 @@ class FeasibleSet:
             self._flat(source, (m,)),
         )
         clipped = self.body.clip(*rows, self.max_facets)
-        body, shrunk = clipped.body, clipped.shrunk
-        if body is self.body and not bool(clipped.outcome.any()):
+        body, decided = clipped.body, not bool(clipped.outcome.any())
+        if body is self.body and decided:
             return self
-        shape, against = self.batch_shape, self.contradiction
-        outcome = torch.maximum(self.outcome, clipped.outcome.reshape(shape))
-        if bool((clipped.outcome == Outcome.EMPTY).any()):
+        shape, outcome, against = self.batch_shape, self.outcome, self.contradiction
+        if not decided:
+            outcome = torch.maximum(outcome, clipped.outcome.reshape(shape))
             found = clipped.contradiction
-            rows = Halfspaces(found.A.reshape(*shape, p + 1, p), found.b.reshape(*shape, p + 1))
-            fresh = Facets(rows, found.time.reshape((*shape, p + 1)), found.source.reshape((*shape, p + 1)))
+            fresh = Facets(
+                Halfspaces(found.A.reshape(*shape, p + 1, p), found.b.reshape(*shape, p + 1)),
+                found.time.reshape((*shape, p + 1)),
+                found.source.reshape((*shape, p + 1)),
+            )
             against = _choose(self.is_empty, against, fresh)
-        last_cut = torch.where(shrunk.reshape(shape), stamp, self.last_cut)
+        last_cut = torch.where(clipped.shrunk.reshape(shape), stamp, self.last_cut)
         return replace(self, body=body, outcome=outcome, contradiction=against, last_cut=last_cut)
 
     def where(self, mask: Bool[Tensor, "*batch"], other: FeasibleSet) -> FeasibleSet:
@@ -263,8 +266,8 @@ class FeasibleSet:
     ) -> Float[Tensor, "*batch p"]:
         """The point of the set nearest to `point` in the norm sqrt(z' metric z) (default: Euclidean).
 
-        Only the symmetric part of the metric counts. NaN, with zero gradients, where the metric is not positive definite,
-        where the point or the metric is not finite, and for an EMPTY item.
+        Only the symmetric part of the metric counts. NaN, with zero gradients, where the metric is not positive
+        definite, where the point or the metric is not finite, and for an EMPTY item.
 
         Raises:
             InputError: point is not (*batch, p), or metric is not (*batch, p, p).

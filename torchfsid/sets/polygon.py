@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -138,17 +139,19 @@ class Polygon:
         parts, outcome, shrunk, against = kernel.clip(
             tuple(map(array, self.fields())), array(A), array(b), array(time), array(source), first, most
         )
-        outcome, shrunk, *against = (torch.from_numpy(part).to(A.device) for part in (outcome, shrunk, *against))
-        if not bool(shrunk.any()):
-            return Clipped(self, outcome, shrunk, Contradiction(*against))
-        body = Polygon(*(torch.from_numpy(part).to(A.device) for part in parts), self.sheets)
+        device = A.device
+        contradiction = Contradiction(*(torch.from_numpy(part).to(device) for part in against))
+        outcomes, smaller = torch.from_numpy(outcome).to(device), torch.from_numpy(shrunk).to(device)
+        if not shrunk.any():
+            return Clipped(self, outcomes, smaller, contradiction)
+        sheets, label = self.sheets, parts[5]
         if differentiable:
-            entered = (body.label >= first).nonzero(as_tuple=True)
-            rows = body.label[entered] - first
-            body.label[entered] = first + torch.arange(len(rows), device=A.device)
-            sheets = self.sheets.with_sheet(A.flatten(0, 1).index_select(0, rows), b.flatten().index_select(0, rows))
-            body = replace(body, sheets=sheets)
-        return Clipped(body._pruned(), outcome, shrunk, Contradiction(*against))
+            entered = label >= first
+            rows = torch.from_numpy(label[entered] - first).to(device)
+            label[entered] = first + np.arange(len(rows))
+            sheets = sheets.with_sheet(A.flatten(0, 1).index_select(0, rows), b.flatten().index_select(0, rows))
+        body = Polygon(*(torch.from_numpy(part).to(device) for part in parts), sheets)
+        return Clipped(body._pruned(), outcomes, smaller, contradiction)
 
     # What is asked of a polygon ------------------------------------------------------------------------------------
 

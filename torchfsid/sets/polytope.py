@@ -26,7 +26,7 @@ from torchfsid.sets import sensitivity
 from torchfsid.sets.body import PRIOR, Clipped, Contradiction
 from torchfsid.sets.cell import Cell, intersect, merged
 from torchfsid.sets.faces import Indices, Mask, Reals
-from torchfsid.sets.shape import Shape
+from torchfsid.sets.shape import FLAT, Shape
 from torchfsid.tolerances import ROUND_OFF
 
 
@@ -158,10 +158,10 @@ class Polytope:
 
         Where the centre is not unique, the one with the smallest z_1 is returned, among these the one with the smallest
         z_2, and so on, with the gradient of the p + 1 facets that decide it so. The radius and its gradient are right
-        in any case. A flat set has the radius 0, up to round-off, around a point of it.
+        in any case. A flat set has the radius 0, around a point of it.
         """
         ball = inscribed_ball(self._recentred)
-        flat = (ball.status == ProgrammeStatus.DEGENERATE) | (ball.status == ProgrammeStatus.EMPTY)
+        flat = ball.radius <= FLAT * self.reach.amax(-1)
         centre = self._middle + torch.where(flat.unsqueeze(-1), 0.0, ball.centre)
         return centre, torch.where(flat, 0.0, ball.radius)
 

@@ -8,45 +8,54 @@ that no facet refers to is dropped, and with it the graph of that intersection: 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchfsid.halfspaces import array
+
 
 @dataclass(frozen=True)
 class Sheets:
-    """Rows A (N, p) and b (N,) with gradients, sheet by sheet; the first row of the first sheet has the label 1."""
+    """Rows A (N, p) and b (N,) with gradients, sheet by sheet; the first row of the first sheet has the label 1.
 
-    sheets: tuple[tuple[Float[Tensor, "N p"], Float[Tensor, "N"]], ...] = ()
+    Attributes:
+        sheets: A and b of each.
+        rows: how many rows there are in all of them.
+    """
 
-    @cached_property
-    def rows(self) -> int:
-        return sum(len(b) for _, b in self.sheets)
+    sheets: tuple[tuple[Tensor, Tensor], ...] = ()
+    rows: int = 0
 
     def with_sheet(self, A: Float[Tensor, "N p"], b: Float[Tensor, "N"]) -> Sheets:
         """One sheet more, its rows labelled on from the last one."""
-        return Sheets((*self.sheets, (A, b))) if len(b) > 0 else self
+        return Sheets((*self.sheets, (A, b)), self.rows + len(b)) if len(b) > 0 else self
 
     def in_use(self, label: Int[Tensor, "B F"]) -> tuple[Sheets, Int[Tensor, "B F"]]:
-        """Without the sheets that no facet is labelled by, and the labels that the facets have then.
+        """Without the rows that are no facets, and the labels that the facets have then.
 
-        Looked for only where there are more than twice as many rows as places for facets, so that it costs little.
+        They are looked for only where there are more than twice as many rows as places for facets, and a sheet is
+        shortened only where half of it is not used: so it costs little, and a row goes through few tensors.
         """
         if self.rows <= 2 * label.numel():
             return self, label
-        used = torch.zeros(self.rows + 1, dtype=torch.bool, device=label.device)
-        used = used.index_fill(0, label.flatten(), True)[1:].split([len(b) for _, b in self.sheets])
-        kept, numbers, first = [], [label.new_zeros(1)], 1
-        for sheet, of_sheet in zip(self.sheets, used, strict=True):
-            rows = len(of_sheet)
-            stays = bool(of_sheet.any())
-            numbers.append(torch.arange(first, first + rows, device=label.device) if stays else label.new_zeros(rows))
-            if stays:
-                kept.append(sheet)
-                first += rows
-        return Sheets(tuple(kept)), torch.cat(numbers)[label]
+        table = array(label)
+        used, numbers = np.zeros(self.rows + 1, dtype=np.bool_), np.zeros(self.rows + 1, dtype=np.int64)
+        used[table] = True
+        sheets, old, new = [], 1, 1
+        for A, b in self.sheets:
+            kept = used[old : old + len(b)].nonzero()[0]
+            if 2 * len(kept) >= len(b):
+                kept = np.arange(len(b))
+                sheets.append((A, b))
+            elif len(kept) > 0:
+                rows = torch.from_numpy(kept).to(b.device)
+                sheets.append((A.index_select(0, rows), b.index_select(0, rows)))
+            numbers[old + kept] = np.arange(new, new + len(kept))
+            old, new = old + len(b), new + len(kept)
+        return Sheets(tuple(sheets), new - 1), torch.from_numpy(numbers[table]).to(label.device)
 
     def joined(self, other: Sheets, label: Int[Tensor, "B F"]) -> tuple[Sheets, Int[Tensor, "B F"]]:
         """These sheets and those of `other`, and what its labels are then. A sheet of both is kept once."""
@@ -59,7 +68,7 @@ class Sheets:
             torch.arange(first[id(sheet)], first[id(sheet)] + len(sheet[1]), device=label.device)
             for sheet in other.sheets
         ]
-        return Sheets(sheets), torch.cat([label.new_zeros(1), *numbers])[label]
+        return Sheets(sheets, next_label - 1), torch.cat([label.new_zeros(1), *numbers])[label]
 
     def attached(
         self, A: Float[Tensor, "B F p"], b: Float[Tensor, "B F"], label: Int[Tensor, "B F"]
@@ -67,9 +76,8 @@ class Sheets:
         """The facets' rows, numbers without gradients, with the gradients of the rows that they are labelled by."""
         if not self.sheets:
             return A, b
-        # Zero, with a gradient: a facet that was moved outward keeps its place.
-        zeros = [(rows - rows.detach(), right - right.detach()) for rows, right in self.sheets]
-        of_A = torch.cat([A.new_zeros(1, A.shape[-1]), *(rows for rows, _ in zeros)])
-        of_b = torch.cat([b.new_zeros(1), *(right for _, right in zeros)])
-        index = label.flatten()
-        return A + of_A.index_select(0, index).reshape(A.shape), b + of_b.index_select(0, index).reshape(b.shape)
+        of_A = torch.cat([A.new_zeros(1, A.shape[-1]), *(rows for rows, _ in self.sheets)])
+        of_b = torch.cat([b.new_zeros(1), *(right for _, right in self.sheets)])
+        of_A, of_b = (part.index_select(0, label.flatten()).unflatten(0, label.shape) for part in (of_A, of_b))
+        # Zeros with gradients are added: a facet that was moved outward keeps its place.
+        return A + (of_A - of_A.detach()), b + (of_b - of_b.detach())

@@ -96,7 +96,7 @@ class Shape:
 
     @cached_property
     def is_flat(self) -> Mask:
-        return self.frame.flat.any(1)
+        return np.asarray(self.frame.flat.any(1))
 
     @cached_property
     def rows(self) -> tuple[Reals, Reals]:
