@@ -85,8 +85,8 @@ def _unclipped(
     reach = limits[:, :1] if by_norm else 2 * limits.amax(-1, keepdim=True)
     tangents = Halfspaces(around, reach.expand(-1, DIRECTIONS))
     inside = Halfspaces.stack([admissible, tangents])
-    nothing = torch.zeros_like(inside.b, dtype=torch.long)
-    clipped = corner.clip(inside.A, inside.b, like.new_zeros(batch), nothing, inside.rows + 4)
+    no_source = torch.zeros_like(inside.b, dtype=torch.long)
+    clipped = corner.clip(inside.A, inside.b, like.new_zeros(batch), no_source, most=inside.rows + 4)
 
     if by_norm:
         outward, touched = _arcs(admissible, limits[:, :1], around)

@@ -29,9 +29,6 @@ from torchfsid.sets.feasible_set import FeasibleSet
 CONDITION = 1e10
 """Largest condition number of the metric: beyond it, the projection would lose its digits before it gained anything."""
 
-INSIDE = 1e-6
-"""A projection this far outside the set, relative to the set's diameter, has lost its digits."""
-
 
 @dataclass(frozen=True)
 class HybridEstimate:
@@ -96,7 +93,7 @@ def _into(sets: FeasibleSet, estimate: UkfEstimate) -> tuple[Float[Tensor, "B p"
     except SolverError:
         theta = torch.full_like(start, torch.nan)
     status = torch.where(usable, HybridStatus.OK, HybridStatus.EUCLIDEAN)
-    found = known & theta.isfinite().all(-1) & sets.contains(theta, INSIDE)
+    found = known & theta.isfinite().all(-1) & sets.contains(theta)
     if not bool(found.all()):
         theta = torch.where(found.unsqueeze(-1), theta, sets.centroid())
         status = torch.where(found, status, HybridStatus.CENTROID)

@@ -72,16 +72,15 @@ def nearest_bodies(
     x = _numbers("x", x)
     if x.ndim != 2:
         raise InputError("x", "positions (bodies, n)", tuple(x.shape))
-    bodies = len(x)
     if not isinstance(count, numbers.Integral) or isinstance(count, bool) or count < 1:
         raise InputError("count", "a positive whole number of slots", count)
     if not within > 0:
         raise InputError("within", "a positive distance [m]", within)
-    index = _indices(robots, bodies).to(x.device)
+    index = _indices(robots, x)
     u, previous_u = (_of_bodies(name, v, x.shape, x) for name, v in (("u", u), ("previous_u", previous_u)))
     sized = {"radius": radius, "position_error": position_error, "velocity_error": velocity_error}
     radius, position_error, velocity_error = (_of_bodies(name, v, x.shape[:1], x) for name, v in sized.items())
-    was_seen = torch.ones(bodies, dtype=torch.bool, device=x.device) if seen is None else _seen(seen, x)
+    was_seen = torch.ones(len(x), dtype=torch.bool, device=x.device) if seen is None else _seen(seen, x)
     lost = (was_seen & ~x.isfinite().all(-1)).nonzero().flatten().tolist()
     if lost:
         raise InputError("x", "finite positions of the bodies seen", f"{x[lost[0]].tolist()} of body {lost[0]}")
@@ -180,13 +179,13 @@ def _seen(seen: Any, x: Tensor) -> Bool[Tensor, "bodies"]:
     return seen
 
 
-def _indices(robots: Sequence[int] | None, bodies: int) -> Tensor:
+def _indices(robots: Sequence[int] | None, x: Tensor) -> Tensor:
     if robots is None:
-        return torch.arange(bodies)
+        return torch.arange(len(x), device=x.device)
     for robot in robots:
-        if not isinstance(robot, numbers.Integral) or isinstance(robot, bool) or not 0 <= robot < bodies:
-            raise InputError("robots", f"indices of bodies, 0 to {bodies - 1}", robot)
-    return torch.tensor([int(robot) for robot in robots], dtype=torch.int64)
+        if not isinstance(robot, numbers.Integral) or isinstance(robot, bool) or not 0 <= robot < len(x):
+            raise InputError("robots", f"indices of bodies, 0 to {len(x) - 1}", robot)
+    return torch.tensor([int(robot) for robot in robots], dtype=torch.int64, device=x.device)
 
 
 def _nearest(x: Tensor, index: Tensor, seen: Tensor, count: int) -> tuple[Tensor, Tensor]:
