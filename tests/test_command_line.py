@@ -13,6 +13,7 @@ import pytest
 
 from torchfsid.commands.command_line import execute
 from torchfsid.commands.interruption import uninterrupted
+from torchfsid.commands.results import seconds
 from torchfsid.commands.results_folder import ResultsFolder
 from torchfsid.commands.terminal import digits, status, track
 from torchfsid.errors import ConfigError, InconsistentError
@@ -189,6 +190,11 @@ def test_progress_that_cannot_be_shown_stops_nothing(monkeypatch: pytest.MonkeyP
     with status("Working"):
         pass
     assert list(track(range(5), "Counting", total=5)) == [0, 1, 2, 3, 4]
+
+
+def test_times_since_1970_keep_their_milliseconds() -> None:
+    assert seconds(1763000000.125) == "1763000000.125 s"
+    assert seconds(0.1 + 0.2) == "0.3 s"
 
 
 @pytest.mark.parametrize(
