@@ -1,6 +1,7 @@
 """The scaffold of all commands: exit codes, one line on stderr, signals, and output that nobody reads."""
 
 import errno
+import io
 import math
 import os
 import signal
@@ -10,11 +11,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from torchfsid.commands.command_line import execute
 from torchfsid.commands.interruption import uninterrupted
+from torchfsid.commands.results import seconds
 from torchfsid.commands.results_folder import ResultsFolder
-from torchfsid.commands.terminal import digits, status, track
+from torchfsid.commands.terminal import digits, status, table, track
 from torchfsid.errors import ConfigError, InconsistentError
 
 
@@ -154,8 +157,8 @@ def test_a_table_that_nobody_reads(target: str) -> None:
         "from torchfsid.commands.terminal import console\n"
         "def action():\n"
         "    shown = console()\n"
-        "    for _ in range(20000):\n"
-        "        shown.print('a line of a table')\n"
+        "    for _ in range(1000):\n"
+        "        shown.print('a line of a table' * 8)\n"
         "sys.exit(execute('prog', action))\n"
     )
     if target == "closed pipe":
@@ -191,6 +194,11 @@ def test_progress_that_cannot_be_shown_stops_nothing(monkeypatch: pytest.MonkeyP
     assert list(track(range(5), "Counting", total=5)) == [0, 1, 2, 3, 4]
 
 
+def test_times_since_1970_keep_their_milliseconds() -> None:
+    assert seconds(1763000000.125) == "1763000000.125 s"
+    assert seconds(0.1 + 0.2) == "0.3 s"
+
+
 @pytest.mark.parametrize(
     ("value", "resolution", "text"),
     [
@@ -210,3 +218,15 @@ def test_digits_enough_to_find_a_point_in_its_set(value: float, resolution: floa
     assert digits(value, resolution) == text
     if math.isfinite(value) and math.isfinite(resolution):
         assert abs(float(text) - value) <= max(resolution, 1e-3 * abs(value))
+
+
+def test_a_narrow_terminal_shows_every_digit() -> None:
+    shown = io.StringIO()
+    made = table("places", ["robot"], ["volume", "diameter", "centroid", "centre", "radius"])
+    point = "(448262.1235, 5411932.123)"
+    made.add_row("r0", "3.53e-05", "0.0068", point, point, "0.00333")
+    Console(file=shown, width=80).print(made)
+    text = shown.getvalue()
+    assert "…" not in text
+    for number in ("3.53e-05", "0.0068", "448262.1235", "5411932.123", "0.00333"):
+        assert number in text

@@ -145,15 +145,17 @@ def test_a_signal_while_the_sets_are_written_waits(
 
 
 class Disk:
-    """A file on a disk that is full after so many bytes."""
+    """A file on a disk that is full after so many bytes, or after which somebody ends the command."""
 
-    def __init__(self, file, room: int):
-        self.file, self.room = file, room
+    def __init__(self, file, room: int, ended: bool):
+        self.file, self.room, self.ended = file, room, ended
 
     def __getattr__(self, name: str):
         return getattr(self.file, name)
 
     def write(self, content: bytes) -> int:
+        if self.room == 0 and self.ended:
+            signal.raise_signal(signal.SIGTERM)
         if self.room == 0:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         written = self.file.write(content[: self.room])
@@ -161,22 +163,23 @@ class Disk:
         return written
 
 
-def test_a_full_disk_ends_the_table_and_not_the_sets(
-    observe: Observe, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("ended", [False, True], ids=["a full disk", "a signal"])
+def test_a_table_that_breaks_off_in_a_line_loses_that_sample_and_not_the_sets(
+    observe: Observe, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, ended: bool
 ) -> None:
     enter = results.ResultsWriter.__enter__
 
     def on_a_small_disk(self: results.ResultsWriter) -> results.ResultsWriter:
         self = enter(self)
-        self._file = Disk(self._file, 700)
+        self._file = Disk(self._file, 700, ended)
         return self
 
     monkeypatch.setattr(results.ResultsWriter, "__enter__", on_a_small_disk)
-    assert observe() == 1
-    captured = capsys.readouterr()
-    out = tmp_path / "out"
-    assert captured.err.splitlines()[-1] == f"torchfsid: {out / 'estimates.csv'}: No space left on device"
-    assert "bob" in captured.out  # the table of what was found
+    assert observe() == (143 if ended else 1)
+    captured, out = capsys.readouterr(), tmp_path / "out"
+    if not ended:
+        assert captured.err.splitlines()[-1] == f"torchfsid: {out / 'estimates.csv'}: No space left on device"
+        assert "bob" in captured.out  # the table of what was found
     assert 0 < len(rows_of(out)) < 2 * SAMPLES
     assert len(rows_of(out)) % 2 == 0
     assert goals_are_inside(out)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchfsid.commands.declared_log import AUTO_FACTOR, DeclaredLog
-from torchfsid.commands.results import constraint_name
+from torchfsid.commands.results import constraint_name, seconds
 from torchfsid.observers.consistency import Consistency
 from torchfsid.sets.feasible_set import FeasibleSet
 
@@ -113,7 +113,7 @@ class Check:
                 first = min(faults, key=lambda fault: fault.first)
                 most = max({fault.row for fault in faults}, key=lambda row: _count(faults, row))
                 lines.append(
-                    f"{name} at {self.declared:.3g} m/s: {_count(faults)}, the first at {first.first:g} s "
+                    f"{name} at {self.declared:.3g} m/s: {_count(faults)}, the first at {seconds(first.first)} "
                     f"({first.row}), most by {most} ({_count(faults, most)})"
                 )
         return lines

@@ -12,6 +12,7 @@ from rich.markup import escape
 from torchfsid.commands.check import Check
 from torchfsid.commands.hypotheses import Hypotheses, HypothesisVerdict
 from torchfsid.commands.observe import Observation, Verdict
+from torchfsid.commands.results import seconds
 from torchfsid.commands.terminal import digits, table
 
 
@@ -24,7 +25,7 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
     verdicts.columns[-1].justify = "left"
     for verdict in observation.verdicts():
         since = verdict.no_information_since
-        resets = "".join(f", reset at {t:g} s" for t in verdict.resets)
+        resets = "".join(f", reset at {seconds(t)}" for t in verdict.resets)
         verdicts.add_row(
             escape(verdict.robot),
             " ".join(f"{case}:{count}" for case, count in verdict.cases.items() if count),
@@ -34,7 +35,7 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
             _point(verdict.centroid, verdict),
             _point(verdict.centre, verdict),
             _size(verdict.radius),
-            "never" if since is None else f"{since:g} s",
+            "never" if since is None else seconds(since),
             _status(verdict.status) + resets,
         )
     console.print(verdicts)
@@ -60,7 +61,7 @@ def print_hypotheses(hypotheses: Hypotheses, out: Path, console: Console) -> Non
             if verdict is None:
                 cells.append("-")
             elif verdict.refuted_at is not None:
-                cells.append(f"refuted at {verdict.refuted_at:g} s by {' / '.join(_rows(verdict))}")
+                cells.append(f"refuted at {seconds(verdict.refuted_at)} by {' / '.join(_rows(verdict))}")
             else:
                 left.append(name)
                 alarm = "" if verdict.status == "ok" else f", {_status(verdict.status)}"
@@ -83,11 +84,11 @@ def print_check(found: Check, name: str, console: Console) -> None:
     )
     for robot in found.robots:
         sizes = [f"{size:.3g}" for size in (robot.smallest_bound, robot.median, robot.p95, robot.worst)]
-        robots.add_row(escape(robot.robot), *sizes, f"{robot.worst_time:g} s", str(robot.samples))
+        robots.add_row(escape(robot.robot), *sizes, seconds(robot.worst_time), str(robot.samples))
         for what, listed in (("unexplained", robot.contradictions), ("violated", robot.violations)):
             for fault in listed:
                 row = escape(f"{fault.row} (soft)" if fault.soft else fault.row)
-                size = [str(fault.samples), f"{fault.first:g} s", f"{fault.worst:.3g}"]
+                size = [str(fault.samples), seconds(fault.first), f"{fault.worst:.3g}"]
                 faults.add_row(escape(robot.robot), what, row, *size)
     if name:
         console.print(f"[bold]{name}[/]")

@@ -156,6 +156,11 @@ class _Descriptions:
         return self._texts
 
 
+def seconds(t: float) -> str:
+    """A time as text, with its milliseconds also where it is counted from 1970."""
+    return f"{t:.13g} s"
+
+
 def constraint_name(source: int, labels: Sequence[str]) -> str:
     """What a `source` of `critical_region` or `inverse_optimal_set` stands for, given the labels of the rows."""
     if source < 0:
@@ -218,7 +223,8 @@ def _indexed(name: str, p: int) -> list[str]:
 
 
 def _number(value: float) -> str:
-    return f"{value:.12g}" if math.isfinite(value) else ""
+    """All digits that mean something; in the coordinates of a country, twelve of them would be hundredths of a mm."""
+    return f"{value:.15g}" if math.isfinite(value) else ""
 
 
 def _texts(values: Tensor) -> list[list[str]]:

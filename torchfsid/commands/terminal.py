@@ -63,12 +63,12 @@ def aside() -> Console:
 
 
 def table(title: str, texts: Sequence[str], numbers: Sequence[str] = ()) -> Table:
-    """Columns of texts, then of numbers."""
+    """Columns of texts, then of numbers, which wrap where a terminal is narrow: no digit is ever cut off."""
     made = Table(title=title, title_justify="left")
     for heading in texts:
         made.add_column(heading, no_wrap=True)
     for heading in numbers:
-        made.add_column(heading, justify="right", no_wrap=True)
+        made.add_column(heading, justify="right", overflow="fold")
     return made
 
 
