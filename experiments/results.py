@@ -130,6 +130,11 @@ def damaged(path: Path, what: str) -> NoReturn:
     raise FigureError(f"{path}: is damaged: {what}")
 
 
+def require_length(path: Path, lines: int, expected: int) -> None:
+    if lines != expected:
+        raise FigureError(f"{path}: has {lines} of {expected} rows: the run broke off, or some were removed")
+
+
 class Columns(dict[str, np.ndarray]):
     """The columns of a table, those of a CSV file as texts. One that is asked for has to be there."""
 
@@ -145,6 +150,11 @@ class Columns(dict[str, np.ndarray]):
         column = self[name]
         with reading(self.path):
             return np.where(column == "", "nan", column).astype(float)
+
+    def of_length(self, rows: int) -> Columns:
+        """Itself, if it has so many rows."""
+        require_length(self.path, len(next(iter(self.values()))), rows)
+        return self
 
     def where(self, **values: object) -> Columns:
         """The rows in which columns of texts have these values."""
