@@ -7,6 +7,7 @@ and summaries come from these files alone.
 from __future__ import annotations
 
 import csv
+import io
 import json
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -166,10 +167,13 @@ class Columns(dict[str, np.ndarray]):
 
 
 def read_columns(path: Path) -> Columns:
-    with reading(path), path.open(newline="", encoding="utf-8") as file:
-        header, *rows = csv.reader(file, strict=True)
+    with reading(path):
+        text = path.read_text(encoding="utf-8")
+        header, *rows = csv.reader(io.StringIO(text, newline=""), strict=True)
         if not rows:
             damaged(path, "it has no rows")
+        if not text.endswith("\n"):
+            damaged(path, "its last line has no end")
         for line, row in enumerate(rows, 2):
             if len(row) != len(header):
                 damaged(path, f"line {line} has {len(row)} cells, its header {len(header)}")
