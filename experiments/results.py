@@ -7,6 +7,7 @@ and summaries come from these files alone.
 from __future__ import annotations
 
 import csv
+import io
 import json
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -130,6 +131,11 @@ def damaged(path: Path, what: str) -> NoReturn:
     raise FigureError(f"{path}: is damaged: {what}")
 
 
+def require_length(path: Path, lines: int, expected: int) -> None:
+    if lines != expected:
+        raise FigureError(f"{path}: has {lines} of {expected} rows: the run broke off, or some were removed")
+
+
 class Columns(dict[str, np.ndarray]):
     """The columns of a table, those of a CSV file as texts. One that is asked for has to be there."""
 
@@ -146,6 +152,11 @@ class Columns(dict[str, np.ndarray]):
         with reading(self.path):
             return np.where(column == "", "nan", column).astype(float)
 
+    def of_length(self, rows: int) -> Columns:
+        """Itself, if it has so many rows."""
+        require_length(self.path, len(next(iter(self.values()))), rows)
+        return self
+
     def where(self, **values: object) -> Columns:
         """The rows in which columns of texts have these values."""
         return self.rows(np.all([self[name] == str(value) for name, value in values.items()], axis=0))
@@ -156,10 +167,13 @@ class Columns(dict[str, np.ndarray]):
 
 
 def read_columns(path: Path) -> Columns:
-    with reading(path), path.open(newline="", encoding="utf-8") as file:
-        header, *rows = csv.reader(file, strict=True)
+    with reading(path):
+        text = path.read_text(encoding="utf-8")
+        header, *rows = csv.reader(io.StringIO(text, newline=""), strict=True)
         if not rows:
             damaged(path, "it has no rows")
+        if not text.endswith("\n"):
+            damaged(path, "its last line has no end")
         for line, row in enumerate(rows, 2):
             if len(row) != len(header):
                 damaged(path, f"line {line} has {len(row)} cells, its header {len(header)}")

@@ -34,7 +34,7 @@ from experiments.runs.saved import Results
 FRAMES, FRAME_MS, COLOURS = 100, 60, 192
 SIZE, DPI = (8.0, 4.0), 100
 
-Update = Callable[[int], Iterable[Artist]]
+Redraw = Callable[[int], Iterable[Artist]]
 """Brings a panel to sample k, and returns what has to be drawn."""
 
 
@@ -67,7 +67,7 @@ def _colours(config: SceneConfig) -> list[str]:
     return [SET_COLOURS[config.set]] if count == 1 else [TEAM[i % len(TEAM)] for i in range(count)]
 
 
-def _map(axes: Axes, results: Results, config: SceneConfig) -> Update:
+def _map(axes: Axes, results: Results, config: SceneConfig) -> Redraw:
     alone, colours = len(config.robots) == 1, _colours(config)
     discs = add_obstacles(axes, config)
     names = list(axes.texts)
@@ -104,7 +104,7 @@ def _map(axes: Axes, results: Results, config: SceneConfig) -> Update:
     return update
 
 
-def _regions(axes: Axes, results: Results, config: SceneConfig) -> Update:
+def _regions(axes: Axes, results: Results, config: SceneConfig) -> Redraw:
     """Every region about its goal, to the scale of the largest."""
     regions = [add_region(axes, np.zeros((3, 2)), colour, filled=True) for colour in _colours(config)]
     scale = axes.text(0.99, 0.98, "", transform=axes.transAxes, ha="right", va="top")
@@ -130,7 +130,7 @@ def _regions(axes: Axes, results: Results, config: SceneConfig) -> Update:
     return update
 
 
-def _curves(axes: Axes, results: Results) -> Update:
+def _curves(axes: Axes, results: Results) -> Redraw:
     """Lengths, over a team their geometric means."""
     measures = lengths(results)
     shown = [

@@ -24,6 +24,7 @@ OBSERVERS = {
 }
 """Those that are drawn: colour and dashes. The others are in the tables."""
 
+LETTERS = "abcdefgh"
 CASES = {"A": "0.8", "B": INVERSE_OPTIMAL, "D": ROBOT}
 
 
@@ -42,7 +43,7 @@ def draw_learning(folder: Path, config: LearnedObserverConfig) -> Iterator[tuple
                 of.numbers("t"), of.numbers("error"), color=colour, ls=dashes, lw=1.4, label=name.replace("ukf", "UKF")
             )
         axes.set(xlabel="t [s]", ylabel="mean error [m]" if i == 0 else "")
-        axes.set_title(f"({'abcdef'[i]}) unseen teams, δ = {noise:g} m/s", fontweight="bold")
+        axes.set_title(f"({LETTERS[i]}) unseen teams, δ = {noise:g} m/s", fontweight="bold")
         axes.grid(True, which="both")
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=9, fontsize=7)
 
@@ -54,7 +55,7 @@ def draw_learning(folder: Path, config: LearnedObserverConfig) -> Iterator[tuple
             label = name if column == "training" else None
             training.plot(values, color=colour, ls=dashes, lw=1.3, label=label)
     training.set(xlabel="epoch", ylabel="mean error [m]")
-    training.set_title("(d) training (solid) and validation (dotted)", fontweight="bold")
+    training.set_title(f"({LETTERS[len(levels)]}) training (solid) and validation (dotted)", fontweight="bold")
     training.grid(True)
     training.legend(fontsize=7, loc="center right", bbox_to_anchor=(1, 0.38))
 
@@ -67,7 +68,7 @@ def draw_learning(folder: Path, config: LearnedObserverConfig) -> Iterator[tuple
             looks = {"color": colour, "ls": dashes, "lw": 4 if letter == "A" else 1.3}
             pull.semilogx(of.numbers("area"), of.numbers("pull"), label=label, **looks)
     pull.set(xlabel="area of Θ [m²]", ylabel="pull to the centroid", ylim=(0, 1))
-    pull.set_title("(e) what the network has learned (solid: least noise)", fontweight="bold")
+    pull.set_title(f"({LETTERS[len(levels) + 1]}) what the network has learned (solid: least noise)", fontweight="bold")
     pull.grid(True)
     pull.legend(fontsize=7)
     figure.suptitle(config.title, fontsize=9, x=0.01, ha="left")

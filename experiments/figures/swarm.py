@@ -23,7 +23,9 @@ SMALLEST = 1e-6
 
 
 def draw_swarm(folder: Path, config: SwarmConfig) -> Iterator[tuple[str, Figure]]:
-    sizes, robots = read_columns(folder / "sizes.csv"), read_columns(folder / "snapshots.csv")
+    sizes = read_columns(folder / "sizes.csv").of_length(config.steps + 1)
+    snapshots = {round(t / config.dt) for t in config.snapshots}
+    robots = read_columns(folder / "snapshots.csv").of_length(config.robots * len(snapshots))
     with reading(folder / "summary.json"):
         lost = int(read_json(folder / "summary.json")["truth_outside"])
     times = np.unique(robots.numbers("t"))

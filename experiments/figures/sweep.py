@@ -18,6 +18,9 @@ from experiments.sweeps.config import SweepConfig
 from experiments.sweeps.swept import Swept, short
 
 BAND = (0.1, 0.9)
+LEGEND_WIDTH = 1.6
+"""Of an entry, on average [inches]."""
+
 SIZES = (
     ("inverse_optimal_sqrt_area", "inverse-optimal set", INVERSE_OPTIMAL),
     ("critical_region_sqrt_area", "paper's region", REGION),
@@ -49,10 +52,9 @@ def _draw(swept: Swept, second: int | None) -> Figure:
             _draw_lengths(grid[1, column], series, SIZES)
             _draw_lengths(grid[2, column], series, ERRORS)
             _draw_cases(grid[3, column], runs)
+            grid[2, column].set_xlabel("t [s]")
         else:
-            grid[1, column].text(0.5, 0.5, "no run yet", ha="center", transform=grid[1, column].transAxes)
-            grid[3, column].set_axis_off()
-        grid[2, column].set_xlabel("t [s]")
+            _draw_nothing(grid[:, column])
         named = [f"{short(key)} {value}" for key, value in zip(swept.telling(0), label, strict=True)] if label else []
         robots = f"{len(runs['run'])} runs, {runs['robots'].sum():.0f} robots"
         grid[0, column].set_title("\n".join([*named, robots]), fontsize=8.5)
@@ -94,6 +96,13 @@ def _draw_lengths(axes: Axes, series: Columns, measures: tuple[tuple[str, str, s
     axes.grid(True)
 
 
+def _draw_nothing(column: np.ndarray) -> None:
+    for axes in column:
+        axes.tick_params(bottom=False, labelbottom=False)
+    column[1].text(0.5, 0.5, "no run yet", ha="center", color="0.4", transform=column[1].transAxes)
+    column[-1].set_axis_off()
+
+
 def _draw_cases(axes: Axes, runs: Columns) -> None:
     left = 0.0
     for letter, colour in CASE_COLOURS.items():
@@ -115,4 +124,5 @@ def _add_legend(figure: Figure) -> None:
         (Patch(color="0.35", alpha=0.25, lw=0), "median and 10 % to 90 % of the robots"),
     ]
     handles, labels = zip(*lines, strict=True)
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(lines), columnspacing=1.5)
+    fitting = min(len(lines), max(1, int(figure.get_figwidth() / LEGEND_WIDTH)))
+    figure.legend(handles, labels, loc="outside lower center", ncols=fitting, columnspacing=1.5)

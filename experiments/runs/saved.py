@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from experiments.results import Columns, damaged, read_columns, read_json, read_lines, reading
+from experiments.results import Columns, read_columns, read_json, read_lines, reading, require_length
 from experiments.runs.config import CasesConfig, SceneConfig
 
 SETS: tuple[Literal["critical_region", "inverse_optimal"], ...] = ("critical_region", "inverse_optimal")
@@ -88,21 +88,17 @@ class Results:
         path, count = self.folder / "regions.jsonl", len(self.robots)
         with reading(path):
             lines = [_region(line) for line in read_lines(path)]
-        if len(lines) != count * len(self.t):
-            damaged(path, f"it has {len(lines)} lines for {len(self.t)} times and {count} robots")
+        require_length(path, len(lines), count * len(self.t))
         return [lines[i : i + count] for i in range(0, len(lines), count)]
 
     @cached_property
     def paths(self) -> dict[str, np.ndarray]:
         """Of every body: (times, 2) [m]."""
-        path = self.folder / "trajectory.csv"
         assert isinstance(self.config, SceneConfig)
-        table, paths = read_columns(path), {}
+        table, paths = read_columns(self.folder / "trajectory.csv"), {}
         for body in self.config.bodies:
-            of_body = table.where(robot=body)
+            of_body = table.where(robot=body).of_length(len(self.t))
             paths[body] = np.stack([of_body.numbers("x"), of_body.numbers("y")], axis=-1)
-            if len(paths[body]) != len(self.t):
-                damaged(path, f"it has {len(paths[body])} rows of {body!r}, estimates.csv {len(self.t)}")
         return paths
 
     @cached_property
@@ -111,11 +107,9 @@ class Results:
 
     @cached_property
     def _table(self) -> Columns:
-        return read_columns(self.folder / "estimates.csv")
+        return read_columns(self.folder / "estimates.csv").of_length((self.config.steps + 1) * len(self.robots))
 
     def _by_robot(self, column: np.ndarray) -> np.ndarray:
-        if len(column) % len(self.robots):
-            damaged(self._table.path, f"it has {len(column)} rows for {len(self.robots)} robots")
         return column.reshape(-1, len(self.robots))
 
 

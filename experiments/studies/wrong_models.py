@@ -40,7 +40,7 @@ LEVELS = ((1e-6, 0.0), (0.02, 0.02), (0.02, 0.002))
 
 
 @dataclass(frozen=True)
-class Model:
+class Belief:
     """What an observer believes, and what it is given to see of the runs.
 
     Attributes:
@@ -71,32 +71,32 @@ def shifted(by: int) -> Callable[[list[Measurement]], list[Measurement]]:
     return shift
 
 
-MODELS = (
-    Model("right model"),
-    Model("right model, saturated run", SATURATED, run=SATURATED),
-    Model("neighbour velocity: none", barriers=[replace(AVOIDANCE, neighbour_velocity="none")]),
-    Model("neighbour velocity: previous", barriers=[replace(AVOIDANCE, neighbour_velocity="previous")]),
-    Model("linear task, saturated run", run=SATURATED),
-    Model("gain + 20 %", GoalTask(1.2 * GAIN)),
-    Model("gain - 20 %", GoalTask(0.8 * GAIN)),
-    Model("gain + 5 %", GoalTask(1.05 * GAIN)),
-    Model("gain + 2 %", GoalTask(1.02 * GAIN)),
-    Model("safety distance + 20 %", barriers=[replace(AVOIDANCE, safety_distance=0.6)]),
-    Model("safety distance - 20 %", barriers=[replace(AVOIDANCE, safety_distance=0.4)]),
-    Model("safety distance + 2 %", barriers=[replace(AVOIDANCE, safety_distance=0.51)]),
-    Model("class-K gain x 2", barriers=[replace(AVOIDANCE, class_k=ClassK(4.0))]),
-    Model("class-K gain / 2", barriers=[replace(AVOIDANCE, class_k=ClassK(1.0))]),
-    Model("a pillar is missing", seen=without_last_pillar),
-    Model("errors 10 times too large", errors=10.0),
-    Model("velocities one sample late", seen=shifted(-1)),
-    Model("velocities one sample early", seen=shifted(1)),
-    Model("wrong task: velocity", VelocityTask()),
-    Model("wrong task: orbit", OrbitTask(0.5)),
+BELIEFS = (
+    Belief("right model"),
+    Belief("right model, saturated run", SATURATED, run=SATURATED),
+    Belief("neighbour velocity: none", barriers=[replace(AVOIDANCE, neighbour_velocity="none")]),
+    Belief("neighbour velocity: previous", barriers=[replace(AVOIDANCE, neighbour_velocity="previous")]),
+    Belief("linear task, saturated run", run=SATURATED),
+    Belief("gain + 20 %", GoalTask(1.2 * GAIN)),
+    Belief("gain - 20 %", GoalTask(0.8 * GAIN)),
+    Belief("gain + 5 %", GoalTask(1.05 * GAIN)),
+    Belief("gain + 2 %", GoalTask(1.02 * GAIN)),
+    Belief("safety distance + 20 %", barriers=[replace(AVOIDANCE, safety_distance=0.6)]),
+    Belief("safety distance - 20 %", barriers=[replace(AVOIDANCE, safety_distance=0.4)]),
+    Belief("safety distance + 2 %", barriers=[replace(AVOIDANCE, safety_distance=0.51)]),
+    Belief("class-K gain x 2", barriers=[replace(AVOIDANCE, class_k=ClassK(4.0))]),
+    Belief("class-K gain / 2", barriers=[replace(AVOIDANCE, class_k=ClassK(1.0))]),
+    Belief("a pillar is missing", seen=without_last_pillar),
+    Belief("errors 10 times too large", errors=10.0),
+    Belief("velocities one sample late", seen=shifted(-1)),
+    Belief("velocities one sample early", seen=shifted(1)),
+    Belief("wrong task: velocity", VelocityTask()),
+    Belief("wrong task: orbit", OrbitTask(0.5)),
 )
 
 
 @dataclass(frozen=True)
-class Outcome:
+class Ending:
     """How the robots of all runs end.
 
     Attributes:
@@ -153,10 +153,10 @@ def joined(teams: Sequence[Measurement]) -> Measurement:
     return Measurement(**columns)
 
 
-def outcome(model: Model, samples: list[Measurement], goals: Tensor, noise: NoiseBound) -> Outcome:
-    """Observe all runs with a model."""
-    observer = SetMembershipObserver(model.task, model.barriers, prior(goals), noise=noise)
-    has_truth = isinstance(model.task, GoalTask)
+def ending(belief: Belief, samples: list[Measurement], goals: Tensor, noise: NoiseBound) -> Ending:
+    """Observe all runs with a belief."""
+    observer = SetMembershipObserver(belief.task, belief.barriers, prior(goals), noise=noise)
+    has_truth = isinstance(belief.task, GoalTask)
     steps = torch.zeros(len(goals))
     for sample in samples:
         observer.update(sample)
@@ -165,10 +165,10 @@ def outcome(model: Model, samples: list[Measurement], goals: Tensor, noise: Nois
     silent = ok & ~(observer.feasible_set.contains(goals) & has_truth)
     away = torch.where(silent, (observer.feasible_set.project(goals) - goals).norm(dim=-1), 0.0)
     consistency = Consistency(
-        samples, model.task, model.barriers, prior(goals), neighbour_velocity=noise.neighbour_velocity
+        samples, belief.task, belief.barriers, prior(goals), neighbour_velocity=noise.neighbour_velocity
     )
     _, relaxed = consistency.sets(torch.as_tensor(noise.velocity).expand(len(goals)) / 2)
-    return Outcome(
+    return Ending(
         flagged=int((~ok).sum()),
         right=int((ok & ~silent).sum()),
         silent=int(silent.sum()),
@@ -184,9 +184,11 @@ def prior(goals: Tensor) -> FeasibleSet:
     return FeasibleSet.from_box(-reach, reach)
 
 
-def automatic(model: Model, samples: list[Measurement], goals: Tensor, neighbour_velocity: float) -> NoiseBound:
+def automatic(belief: Belief, samples: list[Measurement], goals: Tensor, neighbour_velocity: float) -> NoiseBound:
     """What `velocity: auto` takes for each run, for all its robots."""
-    consistency = Consistency(samples, model.task, model.barriers, prior(goals), neighbour_velocity=neighbour_velocity)
+    consistency = Consistency(
+        samples, belief.task, belief.barriers, prior(goals), neighbour_velocity=neighbour_velocity
+    )
     smallest = consistency.smallest_bounds(consistency.fastest).unflatten(0, (-1, ROBOTS)).amax(-1)
     # Where there is no such bound the command ends with an error, which is as good as a flag: take what is refuted.
     smallest = torch.where(smallest.isfinite(), smallest, 0.0)
@@ -202,20 +204,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     runs = {task: simulated(task, chosen.seeds) for task in (TASK, SATURATED)}
     heads = "model", "bound", "errors", "flagged", "ok, inside", "ok, outside", "strained", "away", "silent for"
     print(f"| {' | '.join(heads)} |\n|{'---|' * len(heads)}")
-    for model in MODELS:
-        trajectories, goals = runs[model.run]
+    for belief in BELIEFS:
+        trajectories, goals = runs[belief.run]
         for bound, size in LEVELS:
-            errors = model.errors * size if size else (model.errors - 1.0) * bound
-            samples = model.seen(measured(trajectories, errors))
+            errors = belief.errors * size if size else (belief.errors - 1.0) * bound
+            samples = belief.seen(measured(trajectories, errors))
             declared = NoiseBound(bound, neighbour_velocity=bound)
             label = f"{bound:g}"
             if chosen.auto:
-                declared = automatic(model, samples, goals, bound)
+                declared = automatic(belief, samples, goals, bound)
                 label = f"{float(torch.as_tensor(declared.velocity).median()):.2g}"
-            found = outcome(model, samples, goals, declared)
+            found = ending(belief, samples, goals, declared)
             counts = f"{found.flagged} | {found.right} | {found.silent} | {found.strained} ({found.strained_silent})"
             away = f"{found.away:.2g}" if found.silent else ""
-            print(f"| {model.name} | {label} | {errors:g} | {counts} | {away} | {found.delay:.3g} |", flush=True)
+            print(f"| {belief.name} | {label} | {errors:g} | {counts} | {away} | {found.delay:.3g} |", flush=True)
     return 0
 
 
