@@ -165,20 +165,22 @@ def _sample(model: ObservationModel, theta: FeasibleSet, measurement: Measuremen
     bound, ball, drift = per_row(noise.slack, u), per_row(noise.velocity, u).squeeze(-1), u.new_zeros(())
     if measurement.velocity_error is not None:
         bound, ball = bound + measurement.velocity_error.unsqueeze(-1), ball + measurement.velocity_error
-    usable = ~controller_failed(model.barriers, measurement, rows)
-    if measurement.observed is not None:
-        usable = usable & measurement.observed
-    if measurement.left_out is not None:
-        error = 0.0 if measurement.position_error is None else measurement.position_error
-        nearest, error = bound.squeeze(-1) + noise.neighbour_velocity, u.new_tensor(2 * noise.position) + error
-        usable = usable & left_out_inactive(model.barriers, measurement, nearest, error)
-
+    largest = bound.squeeze(-1)  # slack of an active row whose position is exact
     errors, of_rows, corners = ErrorBounds.of(measurement, model.noise), None, None
     if errors is not None or model.task.saturation is not None:
         corners = theta.vertices().repeat(items // max(robots, 1), 1, 1)
         if errors is not None:
             of_rows = row_errors(model.barriers, parts, measurement, errors)
             bound, drift = bound + of_rows.slack, model.task.drift(errors, corners.abs().amax(-2))
+    usable = ~controller_failed(model.barriers, measurement, rows, of_rows)
+    if measurement.observed is not None:
+        usable = usable & measurement.observed
+    if measurement.left_out is not None:
+        error = u.new_tensor(2 * noise.position)
+        if measurement.position_error is not None:
+            error = error + measurement.position_error
+        usable = usable & left_out_inactive(model.barriers, measurement, largest + noise.neighbour_velocity, error)
+
     return _Sample(
         rows, ~torch.tensor(soft, dtype=torch.bool, device=u.device), u, C.to(torch.float64), d.to(torch.float64),
         usable, bound, ball, drift, of_rows, corners,
