@@ -42,8 +42,8 @@ def measure(
     rows, right = frame.rows(A, b)
     found = (solid.y, *shape.solid_bases, *_padded(*shape.simplices, solid.y.shape[1], b.shape), ~shape.is_flat)
     skeleton = Skeleton(*(torch.as_tensor(field, device=A.device) for field in found))
-    numbers = (torch.as_tensor(field, device=A.device) for field in (solid.volume, solid.centroid))
-    volume, centroid = derivatives.measure(rows, right, *numbers, skeleton)
+    volume, centroid = (torch.as_tensor(field, device=A.device) for field in (solid.volume, solid.centroid))
+    volume, centroid = derivatives.measure(rows, right, volume, centroid, skeleton)
     moved = frame.outside(_change(centroid).unsqueeze(1)).squeeze(1)
     return (
         torch.as_tensor(shape.volume, device=A.device) + _change(volume) * frame.scale.prod(-1),
