@@ -126,6 +126,10 @@ class Polytope:
         origins = [origin[some] for origin, some in zip(self._origins(), kept, strict=True)]
         return self._of(list(cells), origins, _Rows.join(self._rows()))
 
+    def rows(self) -> tuple[Float[Tensor, "B F p"], Float[Tensor, "B F"]]:
+        """A and b; each row carries its gradient."""
+        return self.A, self.b
+
     # What is asked of a polytope ------------------------------------------------------------------------------------
 
     @property
