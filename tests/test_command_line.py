@@ -210,6 +210,7 @@ def test_times_since_1970_keep_their_milliseconds() -> None:
         (2.5, 0.0, "2.5"),
         (1 / 3, 0.0, "0.33333333333333"),
         (float("nan"), 1.0, "-"),
+        (float("inf"), 1.0, "inf"),
         (1.23456789, float("nan"), "1.235"),
         (1.23456789, float("inf"), "1.235"),
     ],

@@ -203,7 +203,7 @@ def regions(robots: Sequence[str], observer: SetMembershipObserver) -> dict:
                     "t": float(event.t),
                     "status": STATUS_NAMES[event.status],
                     "reset": event.reset,
-                    "rows": [{"time": time, "source": source} for time, source in event.rows],
+                    "rows": [{"time": float(time), "source": source} for time, source in event.rows],
                 }
                 for event in events
             ],
