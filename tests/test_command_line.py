@@ -197,6 +197,7 @@ def test_progress_that_cannot_be_shown_stops_nothing(monkeypatch: pytest.MonkeyP
 def test_times_since_1970_keep_their_milliseconds() -> None:
     assert seconds(1763000000.125) == "1763000000.125 s"
     assert seconds(0.1 + 0.2) == "0.3 s"
+    assert seconds(4 / 3) == "1.3333 s"
 
 
 @pytest.mark.parametrize(

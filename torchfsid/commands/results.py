@@ -157,8 +157,8 @@ class _Descriptions:
 
 
 def seconds(t: float) -> str:
-    """A time as text, with its milliseconds also where it is counted from 1970."""
-    return f"{t:.13g} s"
+    """A time as text, to a tenth of a millisecond, also where it is counted from 1970."""
+    return f"{round(t, 4):.15g} s"
 
 
 def constraint_name(source: int, labels: Sequence[str]) -> str:
