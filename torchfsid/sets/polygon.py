@@ -94,7 +94,7 @@ class Polygon:
     def select(self, items: Int[Tensor, "k"]) -> Polygon:
         """The sub-batch at `items`, without the slots that none of it needs."""
         slots = int(self.count[items].max()) if len(items) > 0 else self.slots
-        return Polygon(*(part.index_select(0, items) for part in self._resized(slots)), self.sheets)._pruned()
+        return Polygon(*(part.index_select(0, items) for part in self._resized(slots)), sheets=self.sheets)._pruned()
 
     def replaced(self, items: Int[Tensor, "k"], other: Polygon) -> Polygon:
         """This batch with `other` in the places `items`, and no more slots than that needs."""
@@ -105,7 +105,7 @@ class Polygon:
         slots = max(int(staying.max()), int(other.count.max()))
         mine, theirs = self._resized(slots), replace(other, label=label)._resized(slots)
         parts = (part.index_copy(0, items, new) for part, new in zip(mine, theirs, strict=True))
-        return Polygon(*parts, sheets)._pruned()
+        return Polygon(*parts, sheets=sheets)._pruned()
 
     def _pruned(self) -> Polygon:
         """Without the sheets of rows that are no edges any more."""
@@ -150,7 +150,7 @@ class Polygon:
             rows = torch.from_numpy(label[entered] - first).to(device)
             label[entered] = first + np.arange(len(rows))
             sheets = sheets.with_sheet(A.flatten(0, 1).index_select(0, rows), b.flatten().index_select(0, rows))
-        body = Polygon(*(torch.from_numpy(part).to(device) for part in parts), sheets)
+        body = Polygon(*(torch.from_numpy(part).to(device) for part in parts), sheets=sheets)
         return Clipped(body._pruned(), outcomes, smaller, contradiction)
 
     # What is asked of a polygon ------------------------------------------------------------------------------------
