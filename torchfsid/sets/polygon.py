@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -136,7 +135,7 @@ class Polygon:
         """See `Body`. Edges whose neighbours cannot be extended to meet (of a parallelogram) are never merged."""
         differentiable = torch.is_grad_enabled() and (A.requires_grad or b.requires_grad)
         first = 1 + self.sheets.rows if differentiable else 0
-        parts, outcome, shrunk, against = kernel.clip(
+        parts, outcome, shrunk, entered, against = kernel.clip(
             tuple(map(array, self.fields())), array(A), array(b), array(time), array(source), first, most
         )
         device = A.device
@@ -144,11 +143,9 @@ class Polygon:
         outcomes, smaller = torch.from_numpy(outcome).to(device), torch.from_numpy(shrunk).to(device)
         if not shrunk.any():
             return Clipped(self, outcomes, smaller, contradiction)
-        sheets, label = self.sheets, parts[5]
+        sheets = self.sheets
         if differentiable:
-            entered = label >= first
-            rows = torch.from_numpy(label[entered] - first).to(device)
-            label[entered] = first + np.arange(len(rows))
+            rows = torch.from_numpy(entered).to(device)
             sheets = sheets.with_sheet(A.flatten(0, 1).index_select(0, rows), b.flatten().index_select(0, rows))
         body = Polygon(*(torch.from_numpy(part).to(device) for part in parts), sheets=sheets)
         return Clipped(body._pruned(), outcomes, smaller, contradiction)
