@@ -67,7 +67,7 @@ def observed(scene: SceneConfig, times: tuple[float, ...]) -> dict[str, Any]:
     }
     for kind in SETS:
         row |= {f"{kind}_{name}": value for name, value in _of_set(observers, kind, lost_since[kind]).items()}
-    row |= {name: _rounded(float(values.median())) for name, values in sizes.items()}
+    row |= {name: _rounded(float(values.nanmedian())) for name, values in sizes.items()}
     return {"row": row, "series": series, "seconds": round(time.perf_counter() - began, 3)}
 
 
