@@ -224,14 +224,14 @@ def from_frame(L, metric, y, z, x):
     size = 0.0
     for i in range(len(x)):
         x[i] = z[i] - y[i]
-        size += abs(x[i])
+        size += abs(z[i]) + abs(y[i])
     if metric:
         size = 0.0
         for i in range(len(x)):
             total = 0.0
             for j in range(i, len(x)):
                 total += L[j, i] * x[j]
-                size += abs(L[j, i] * x[j])
+                size += abs(L[j, i]) * (abs(z[j]) + abs(y[j]))
             x[i] = total
     return size
 
