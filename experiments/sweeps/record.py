@@ -53,7 +53,7 @@ def observed(scene: SceneConfig, times: tuple[float, ...]) -> dict[str, Any]:
         if k in kept or k == recording.samples - 1:
             sizes = _sizes(estimate, sets, recording.goals)
         if k in kept:
-            series += _series(measurement.t, recording.robots, sizes, sets, observers)
+            series += _series(measurement.time, recording.robots, sizes, sets, observers)
     shares = (cases / cases.sum()).tolist()
     stopped = [t for t in simulated.true.deadlocked_since.tolist() if not math.isnan(t)]
     row = {

@@ -66,6 +66,10 @@ class AvoidanceConfig(Strict):
             )
         return self
 
+    @property
+    def uses_radius(self) -> bool:
+        return self.margin is not None
+
     def require_radii(self, radius: Sequence[float] | None) -> None:
         """Raises `ConfigError` if the rows need radii that the log does not have."""
         if self.margin is not None and radius is None:
@@ -90,6 +94,10 @@ class AvoidanceConfig(Strict):
 
 class _RobotsOwn(Strict):
     """Rows that do not depend on other bodies."""
+
+    @property
+    def uses_radius(self) -> bool:
+        return False
 
     def require_radii(self, radius: Sequence[float] | None) -> None:
         pass

@@ -325,7 +325,7 @@ def clip(polygons, A, b, stamp, source, first_label, most):
     return result, outcome, shrunk, entered[:new], (lost_A, lost_b, lost_time, lost_source)
 
 
-@item
+@launcher
 @no_type_check
 def _widened(polygons, slots):
     """A copy with room for `slots` vertices; new slots repeat the first vertex and carry padding rows."""
