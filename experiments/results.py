@@ -9,10 +9,11 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn, Self
 
 import numpy as np
 
@@ -204,27 +205,44 @@ def whole(path: Path) -> Iterator[Path]:
         raise
 
 
-class RowWriter:
-    """Writes a CSV file row by row; what it has been given is on disk. The first row's keys are its header."""
+class Appender:
+    """Appends to a file, each piece whole or not at all: a full disk cuts nothing in two."""
 
-    def __init__(self, path: Path):
-        self._path, self._file = path, path.open("w", newline="", encoding="utf-8")
-        self._csv: csv.DictWriter | None = None
+    def __init__(self, path: Path, keep: bool = False):
+        self.path, self.file = path, path.open("a+b" if keep else "wb", buffering=0)
 
-    def __enter__(self) -> RowWriter:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._file.close()
+        self.file.close()
+
+    def append(self, piece: str) -> None:
+        left, whole = piece.encode(), self.file.seek(0, os.SEEK_END)
+        try:
+            with named(self.path):
+                while left:
+                    left = left[self.file.write(left) :]
+        except BaseException:
+            self.file.truncate(whole)
+            raise
+
+
+class RowWriter(Appender):
+    """Writes a CSV file, some rows at a time. The first row's keys are its header."""
+
+    header: list[str] | None = None
 
     def write(self, rows: Iterable[dict[str, Any]]) -> None:
-        with named(self._path):
-            for row in rows:
-                if self._csv is None:
-                    self._csv = csv.DictWriter(self._file, list(row))
-                    self._csv.writeheader()
-                self._csv.writerow(row)
-            self._file.flush()
+        rows, text = list(rows), io.StringIO(newline="")
+        if not rows:
+            return
+        writer = csv.DictWriter(text, self.header or list(rows[0]))
+        if self.header is None:
+            writer.writeheader()
+        writer.writerows(rows)
+        self.append(text.getvalue())
+        self.header = list(writer.fieldnames)
 
 
 def write_rows(path: Path, rows: Iterable[dict[str, Any]]) -> None:

@@ -12,7 +12,9 @@ from rich.table import Table
 
 def table(texts: Sequence[str], numbers: Sequence[str] = (), title: str | None = None) -> Table:
     """Columns of texts, then of numbers. Where a console is too narrow cells are wrapped: nothing is cut off."""
-    made = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1), pad_edge=False)
+    made = Table(
+        title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1), pad_edge=False, collapse_padding=True
+    )
     for heading in texts:
         made.add_column(heading, overflow="fold")
     for heading in numbers:

@@ -148,6 +148,21 @@ def test_a_full_disk_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert (tmp_path / "out" / "summary.json").exists()
 
 
+def test_what_does_not_fit_on_the_disk_is_not_cut_in_two(tmp_path: Path):
+    """Files of at most 32 kB: the run ends with the name of the file, and every line that is there is whole."""
+    out = tmp_path / "out"
+    limited = "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (32768, 32768)); "
+    program = limited + "from experiments.__main__ import main; sys.exit(main(sys.argv[1:]))"
+    ran = subprocess.run(
+        [sys.executable, "-c", program, *command("scene", out, "duration=1")], cwd=ROOT, capture_output=True, text=True
+    )
+    assert ran.returncode == 1
+    assert ran.stderr.splitlines()[-1] == f"experiments: {out / 'regions.jsonl'}: File too large"
+    for name in ("regions.jsonl", "estimates.csv", "trajectory.csv"):
+        assert (out / name).read_bytes().endswith(b"\n")
+    assert (out / "regions.json").exists()
+
+
 # Missing and damaged ------------------------------------------------------------------------------------------------
 
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from experiments.kinds import Track
+from experiments.results import Appender
 from experiments.runs.observers import Observers
 from experiments.runs.recording import Recording
 from torchfsid.commands.results import ResultsWriter
@@ -26,13 +27,12 @@ def observe(observers: Observers, out: Path, track: Track) -> None:
     alongside = {kind: observers.sets[kind] for kind in others}
     with (
         ResultsWriter(out, recording.robots, observers.sets[first], alongside) as results,
-        (out / "regions.jsonl").open("w", encoding="utf-8") as regions,
+        Appender(out / "regions.jsonl") as regions,
     ):
         for measurement in track(recording.measurements, "Observing", recording.samples):
             estimate, sets = observers.update(measurement)
             results.write(measurement, estimate, {kind: sets[kind] for kind in others})
-            regions.writelines(json.dumps(line) + "\n" for line in _regions(recording, measurement, sets))
-            regions.flush()
+            regions.append("".join(json.dumps(line) + "\n" for line in _regions(recording, measurement, sets)))
 
 
 def _regions(recording: Recording, measurement: Measurement, sets: dict[str, SetEstimate]) -> Iterator[dict[str, Any]]:

@@ -10,13 +10,12 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
-from torchfsid.commands.results_folder import named
+from experiments.results import Appender
 
 
-class Journal:
+class Journal(Appender):
     """Use it as a context manager.
 
     Attributes:
@@ -24,27 +23,17 @@ class Journal:
     """
 
     def __init__(self, path: Path):
-        self.path = path
-        self.records: dict[int, dict[str, Any]] = {}
-
-    def __enter__(self) -> Journal:
-        self._file = self.path.open("a+b")
-        self._file.seek(0)
-        *lines, rest = self._file.read().split(b"\n")
-        self._file.truncate(self._file.tell() - len(rest))
+        super().__init__(path, keep=True)
+        self.file.seek(0)
+        *lines, rest = self.file.read().split(b"\n")
+        self.file.truncate(self.file.tell() - len(rest))
         records = filter(None, map(_parse, lines))
-        self.records = {record["run"]: record for record in records}
-        return self
+        self.records: dict[int, dict[str, Any]] = {record["run"]: record for record in records}
 
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self._file.close()
-
-    def append(self, record: dict[str, Any]) -> None:
+    def add(self, record: dict[str, Any]) -> None:
         """Once this returns, the record survives a crash."""
-        with named(self.path):
-            self._file.write(json.dumps(record, allow_nan=False).encode() + b"\n")
-            self._file.flush()
-            os.fsync(self._file.fileno())
+        self.append(json.dumps(record, allow_nan=False) + "\n")
+        os.fsync(self.file.fileno())
         self.records[record["run"]] = record
 
 

@@ -66,7 +66,8 @@ def _quantiles(values: np.ndarray) -> list[float] | None:
 def print_sweep(summary: dict[str, Any], console: Console) -> None:
     """Robots whose set lost the truth, and medians at the end, for each point of the grid."""
     numbers = "runs", "robots", "paper's lost", "silently", "√area", "inv.-opt. lost", "√area", "UKF", "hybrid"
-    shown = table(summary["keys"], numbers)
+    texts, numbers = ([heading.replace(" ", "\n") for heading in of] for of in (summary["keys"], numbers))
+    shown = table(texts, numbers)
     for point in summary["points"]:
         paper, ours = (point[kind] for kind in SETS)
         counts = point["runs"], point["robots"], paper["lost"], paper["lost_in_silence"]

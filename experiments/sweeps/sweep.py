@@ -28,7 +28,7 @@ def run_sweep(config: SweepConfig, out: Path, track: Track, team: Workers | None
         try:
             calls = ((config, run) for run in missing)
             for done in track((team or alone)(record, calls), "Sweeping", config.runs, finished):
-                journal.append(done)
+                journal.add(done)
         finally:
             write_tables(out, config, [journal.records[run] for run in sorted(journal.records)])
     return summarise_sweep(out, config)
