@@ -197,6 +197,7 @@ def test_progress_that_cannot_be_shown_stops_nothing(monkeypatch: pytest.MonkeyP
 def test_times_since_1970_keep_their_milliseconds() -> None:
     assert seconds(1763000000.125) == "1763000000.125 s"
     assert seconds(0.1 + 0.2) == "0.3 s"
+    assert seconds(4 / 3) == "1.3333 s"
 
 
 @pytest.mark.parametrize(
@@ -210,6 +211,7 @@ def test_times_since_1970_keep_their_milliseconds() -> None:
         (2.5, 0.0, "2.5"),
         (1 / 3, 0.0, "0.33333333333333"),
         (float("nan"), 1.0, "-"),
+        (float("inf"), 1.0, "inf"),
         (1.23456789, float("nan"), "1.235"),
         (1.23456789, float("inf"), "1.235"),
     ],

@@ -98,7 +98,7 @@ def test_the_sample_of_a_joint_qp():
     assert config.noise.build() == NoiseBound(0.02, 0.02)
     assert (config.set, config.velocity, config.obstacles) == ("inverse_optimal", "logged", ())
     assert config.neighbour_velocities == {"current"}
-    assert not config.uses_radius
+    config.barriers[0].require_radii(None)
 
 
 def test_the_sample_with_radii():
@@ -109,7 +109,10 @@ def test_the_sample_with_radii():
     ]
     assert config.noise.build() == NoiseBound(1e-5)
     assert config.neighbour_velocities == {"previous"}
-    assert config.uses_radius
+    config.barriers[0].require_radii([0.2, 0.2])
+    assert "a margin needs the radii" in refusal(lambda: config.barriers[0].require_radii(None))
+    touching = observe("barriers.0.margin=0", text=IRSIM).barriers[0]
+    assert "a margin of 0 needs positive radii" in refusal(lambda: touching.require_radii([0.0, 0.2]))
 
 
 TASKS = {

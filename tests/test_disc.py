@@ -11,6 +11,7 @@ import torch
 
 from tests.problems import exact_inscribed_radius
 from torchfsid.halfspaces import Halfspaces
+from torchfsid.kernels import disc
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.outcome import Outcome
 from torchfsid.robots.barriers import ClassK, CollisionAvoidance
@@ -25,7 +26,7 @@ HALF = 5.0
 
 def inside(rows: np.ndarray, bounds: np.ndarray, offset: np.ndarray) -> FeasibleSet:
     """The sets {z : rows (z - offset) <= bounds} in boxes around the offsets."""
-    centre = torch.from_numpy(offset)
+    centre = torch.tensor(offset)
     b = bounds + (rows * offset[:, None]).sum(-1)
     return FeasibleSet.from_box(centre - HALF, centre + HALF).intersect(
         Halfspaces(torch.from_numpy(rows), torch.from_numpy(b))
@@ -91,6 +92,19 @@ def test_two_pairs_of_opposite_edges(rows: list, bounds: list, expected: float) 
     verdict = sets.emptiness()
     assert verdict.outcome.item() == Outcome.NONEMPTY
     assert sets.contains(verdict.witness).all()
+
+
+def test_the_general_programme_takes_over_where_the_search_gives_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    A, b = shapes("parallelogram", 0.5, 20, np.random.default_rng(3))
+    sets = inside(A, b, np.zeros((20, 2)))
+    _, radius = sets.chebyshev()
+    search = disc.inscribed
+    monkeypatch.setattr(
+        disc, "inscribed", lambda *rows: (*(0 * part for part in search(*rows)[:3]), np.zeros(20, bool))
+    )
+    other_centre, other_radius = sets.chebyshev()
+    torch.testing.assert_close(other_radius, radius, rtol=1e-12, atol=0)
+    assert sets.contains(other_centre).all()
 
 
 def test_a_robot_jammed_between_two_bodies_has_a_disc() -> None:

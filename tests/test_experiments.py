@@ -312,6 +312,7 @@ def test_timeline_and_stays_below():
     assert stays_below(t, np.array([3.0, 0.5, 2.0, 0.5]), 1.0) == 0.3
     assert stays_below(t, np.array([0.5, 0.5, 0.5, 0.5]), 1.0) == 0.0
     assert stays_below(t, np.array([0.5, 0.5, 0.5, 2.0]), 1.0) is None
+    assert stays_below(t, np.array([0.5, 0.5, np.nan, np.nan]), 1.0) is None
 
 
 @pytest.mark.parametrize(("switch", "deviation"), [(3, 0.2), (5, 0.0), (6, 0.1)])

@@ -49,7 +49,7 @@ def test_boxes_cut_to_facets_edges_and_points_in_any_order(p: int, turned: bool)
     for pinned in range(1, p + 1):
         Q = np.linalg.qr(rng.normal(size=(p, p)))[0] if turned else np.eye(p)
         truth = rng.uniform(-2, 2, p) if turned else rng.choice([-SIDE, SIDE, 0.0, 1 / 3], p)
-        ways = orders(2 * pinned, most=24)
+        ways = orders(2 * pinned, most=12)
         rows = np.vstack([Q[:pinned], -Q[:pinned]]) * np.exp(rng.normal(size=(2 * pinned, 1)))
         A = tensor(rows[ways])
         b = A @ tensor(truth)
@@ -83,7 +83,7 @@ def test_boxes_cut_to_facets_edges_and_points_in_any_order(p: int, turned: bool)
                     torch.testing.assert_close(flat.diameter(), diameter, rtol=0, atol=10 * NOISE)
 
 
-@pytest.mark.parametrize("around", [0.0, 1e3, 1e6])
+@pytest.mark.parametrize("around", [0.0, 1e6])
 @pytest.mark.parametrize("p", [1, 3, 4])
 def test_a_smaller_bound_never_gives_a_larger_set(p: int, around: float) -> None:
     """Exact data with bounds from 0 to 1e-6, rows in several orders: nested, and the same set in each, to round-off."""
@@ -93,7 +93,7 @@ def test_a_smaller_bound_never_gives_a_larger_set(p: int, around: float) -> None
         truth, rows = np.round(rng.uniform(-4, 4, p)) + around, rng.integers(2, 7)
         A = rng.normal(size=(rows, p)) if seed % 2 else rng.integers(-3, 4, size=(rows, p)).astype(float)
         A = np.vstack([A, -A]) if seed % 4 < 2 else A
-        ways = torch.as_tensor(orders(len(A), most=4))
+        ways = torch.as_tensor(orders(len(A), most=3))
         directions, smaller = tensor(rng.normal(size=(6, p))), None
         for bound in (0.0, 1e-16, 1e-14, 1e-12, 1e-9, 1e-6):
             b = A @ truth + bound * np.linalg.norm(A, axis=1)

@@ -150,3 +150,27 @@ def test_gradients_are_finite_at_a_bodys_place() -> None:
         for gradient in torch.autograd.grad(found.omega.A.sum() + found.omega.b.sum(), (x, bodies)):
             assert bool(gradient.isfinite().all())
             assert bool((gradient[1] != 0).any())
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_controller_that_may_have_failed_says_nothing(compiled: bool) -> None:
+    """Jammed between two bodies, a little too near to both: the QP has no solution and the robot stops. Measured, the
+    gap is wide enough, and standing still would say that the robot has arrived."""
+    barrier = CollisionAvoidance(ClassK(1.0), safety_distance=0.5)
+    goal, there = torch.tensor([[0.3, 3.0]], dtype=torch.float64), torch.ones(1, 2, dtype=torch.bool)
+    x = torch.zeros(1, 2, dtype=torch.float64)
+    jammed = torch.tensor([[[-0.48, 0.0], [0.48, 0.0]]], dtype=torch.float64)
+    control = CbfQpController(GoalTask(1.0), [barrier])(Measurement(0.0, x, None, jammed, there), goal)
+    assert not control.feasible.any()
+    prior = FeasibleSet.from_box(torch.full((1, 2), -5.0), torch.full((1, 2), 5.0))
+    for noise, error in (
+        (NoiseBound(1e-3, position=0.03), None),
+        (NoiseBound(1e-3), torch.full((1, 2), 0.03).double()),
+    ):
+        watching = SetMembershipObserver(GoalTask(1.0), [barrier], prior, noise=noise, compiled=compiled)
+        seen = Measurement(0.0, x, control.u, 1.06 * jammed, there, body_position_error=error)
+        estimate = watching.update(seen)
+        assert estimate.feasible_set.contains(goal).all()
+        assert not estimate.informative.any()
+        clear = watching.update(replace(seen, t=1.0, bodies=3 * jammed, u=x))
+        assert clear.informative.all()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import io
 import json
 import os
@@ -29,6 +30,8 @@ SHORT = {
     "cases": ("run", "five_cases", "duration=0.1"),
     "swarm": ("run", "swarm", "robots=20", "side=7.5", "duration=0.06", "snapshots=[0.03]"),
 }
+
+SIZES = ("diameter", "centre_0", "centre_1", "radius", "centroid_0", "centroid_1")
 
 pytestmark = pytest.mark.usefixtures("unchecked")
 
@@ -188,6 +191,25 @@ def test_a_damaged_file_is_named(
         assert_names(out / name, "no number", capsys)
     (out / name).unlink()
     assert_names(out / name, "missing", capsys)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("kind", ["scene", "cases"])
+def test_an_empty_set_is_drawn_as_nothing(kind: str, finished: Callable[[str], Path], tmp_path: Path):
+    """It has no vertices, and where it has no size its cells are empty."""
+    out = tmp_path / "out"
+    shutil.copytree(finished(kind), out)
+    lines = [json.loads(line) for line in (out / "regions.jsonl").read_text(encoding="utf-8").splitlines()]
+    emptied = [json.dumps({**line, "critical_region": [], "inverse_optimal": []}) + "\n" for line in lines]
+    (out / "regions.jsonl").write_text("".join(emptied), encoding="utf-8")
+    with (out / "estimates.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    sizes = [name for name in rows[0] if name.endswith(SIZES)]
+    with (out / "estimates.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows({**row, **dict.fromkeys(sizes, "")} for row in rows)
+    assert main(["figures", str(out)]) == 0
 
 
 def assert_names(path: Path, what: str, capsys: pytest.CaptureFixture[str]) -> None:

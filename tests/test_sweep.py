@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
@@ -17,16 +18,19 @@ import jaxtyping
 import numpy as np
 import pytest
 from distributed import LocalCluster
+from rich.console import Console
 
 from experiments.__main__ import main
 from experiments.kinds import load
 from experiments.sweeps.config import SweepConfig
 from experiments.sweeps.journal import Journal
+from experiments.sweeps.summary import print_sweep, summarise_sweep
 from experiments.sweeps.sweep import run_sweep
 from experiments.sweeps.tables import read_table
-from experiments.sweeps.workers import workers
+from experiments.sweeps.workers import WorkersError, workers
 from torchfsid.commands.results_folder import ResultsFolder
-from torchfsid.errors import ConfigError
+from torchfsid.config.documents import dump
+from torchfsid.errors import ConfigError, FigureError
 
 ROOT = Path(__file__).parents[1]
 TABLES = ("runs.csv", "runs.parquet", "series.csv", "series.parquet")
@@ -128,10 +132,28 @@ def test_killed_twice_and_resumed_is_the_uninterrupted_sweep(config: Path, unint
 def test_a_dask_cluster_gives_the_same(config: Path, uninterrupted: Path, tmp_path: Path):
     # Workers in threads, reached over TCP: starting processes would take longer than the sweep.
     local = {"processes": False, "protocol": "tcp://", "dashboard_address": None}
-    with LocalCluster(n_workers=2, threads_per_worker=1, **local) as cluster:
-        with workers(dask=cluster.scheduler_address) as team:
-            run_sweep(load_sweep(config), tmp_path, untracked, team)
+    with (
+        LocalCluster(n_workers=2, threads_per_worker=1, **local) as cluster,
+        workers(dask=cluster.scheduler_address) as team,
+    ):
+        run_sweep(load_sweep(config), tmp_path, untracked, team)
     assert_same_tables(tmp_path, uninterrupted)
+
+
+def test_a_dask_cluster_that_dies_is_one_error(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("experiments.sweeps.workers.DASK_TIMEOUT", 0.5)
+    local = {"processes": False, "protocol": "tcp://", "dashboard_address": None}
+    cluster = LocalCluster(n_workers=1, threads_per_worker=1, **local)
+
+    def until_it_dies(records: Iterable[Any], *_: Any) -> Iterable[Any]:
+        for record in records:
+            yield record
+            cluster.close()
+
+    with pytest.raises(WorkersError, match="goes on from here"), workers(dask=cluster.scheduler_address) as team:
+        run_sweep(load_sweep(config), tmp_path, until_it_dies, team)
+    assert 1 <= finished(tmp_path) < RUNS
+    assert len(read_table(tmp_path / "runs.parquet")["run"]) == finished(tmp_path)
 
 
 def test_nothing_is_run_again_and_figures_are_drawn_from_the_tables(config: Path, uninterrupted: Path, tmp_path: Path):
@@ -224,6 +246,39 @@ def test_a_failed_run_is_a_row_and_not_the_end(config: Path, tmp_path: Path):
     assert 0 < failed.sum() < RUNS
     assert all("no room" in error for error in runs["error"][failed])
     assert summary["failed"] == failed.sum()
+
+
+def test_keys_with_dots_can_be_set(config: Path):
+    grid = "grid.measurement_noise.velocity,noise.velocity=[[0.01, 0.02]]"
+    changed = load_sweep(config, "draw.task.gain=[1, 2]", grid, "grid.task.kind=[goal]")
+    assert changed.draw == {"task.gain": (1.0, 2.0)}
+    assert changed.grid == {"measurement_noise.velocity, noise.velocity": [[0.01, 0.02]], "task.kind": ["goal"]}
+
+
+def test_an_interrupted_sweep_is_drawn_with_a_gap(config: Path, uninterrupted: Path, tmp_path: Path):
+    """Runs of the first point of the grid only."""
+    lines = (uninterrupted / "records.jsonl").read_bytes().splitlines(keepends=True)
+    (tmp_path / "records.jsonl").write_bytes(b"".join(line for line in lines if json.loads(line)["run"] < 5))
+    (tmp_path / "config.yaml").write_text(dump(load_sweep(config)), encoding="utf-8")
+    with pytest.raises(KeyboardInterrupt):
+        run_sweep(load_sweep(config), tmp_path, interrupted)
+    assert main(["figures", str(tmp_path)]) == 0
+    summary = summarise_sweep(tmp_path, load_sweep(config))
+    assert [point["runs"] for point in summary["points"]] == [5, 0]
+    print_sweep(summary, Console(file=io.StringIO()))
+
+
+def interrupted(records: Iterable[Any], *_: Any) -> Iterable[Any]:
+    raise KeyboardInterrupt
+
+
+def test_a_sweep_in_which_every_run_fails_says_so(config: Path, tmp_path: Path):
+    sweep = load_sweep(config)
+    crowded = {"robots": [9, 9], "place": ["disc"], "radius": 0.6, "separation": 0.6}
+    failing = sweep.model_copy(update={"experiment": {**sweep.experiment, "team": crowded}})
+    with pytest.raises(FigureError, match="every run failed, as with: team: no room"):
+        run_sweep(failing, tmp_path, untracked)
+    assert (tmp_path / "runs.csv").exists()
 
 
 # What it refuses ----------------------------------------------------------------------------------------------------

@@ -171,7 +171,7 @@ def test_a_solver_that_fails_leaves_the_motion_unknown(monkeypatch: pytest.Monke
         raise SolverError("no solution, no certificate")
 
     with monkeypatch.context() as patch:
-        patch.setattr("torchfsid.observers.ukf.solve_safe_qp", fails)
+        patch.setattr("torchfsid.observers.motions.solve_safe_qp", fails)
         estimate = ukf.update(second)
     assert estimate.status.item() == FilterStatus.PREDICTED
     torch.testing.assert_close(estimate.theta, before.theta, atol=0, rtol=0)

@@ -85,23 +85,29 @@ class Halfspaces:
 
     def norms(self) -> Float[Tensor, "*batch m"]:
         """|a_j|, with 1 for padding rows, so that dividing by it is always safe (and so is its gradient)."""
-        squared = dot(self.A, self.A)
-        padding = squared == 0
-        return torch.where(padding, 1.0, squared.masked_fill(padding, 1.0).sqrt())
+        return lengths(self.A)
 
     def normalised(self) -> Halfspaces:
         """The same set with unit rows (padding rows are left as they are)."""
-        norms = self.norms()
-        return Halfspaces(self.A / norms.unsqueeze(-1), self.b / norms, self.source)
+        A, b, norms = self._scaled()
+        return Halfspaces(A / norms.unsqueeze(-1), b / norms, self.source)
 
     def slack(self, z: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch m"]:
         """(b_j - a_j.z)/|a_j|: the signed distance of z to each boundary, positive inside, in the units of z."""
-        return (self.b - dot(self.A, z.to(torch.float64).unsqueeze(-2))) / self.norms()
+        A, b, norms = self._scaled()
+        return (b - dot(A, z.to(torch.float64).unsqueeze(-2))) / norms
 
     def round_off(self, z: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch m"]:
         """What floating point leaves open about `slack(z)`, in the units of z."""
-        sizes = dot(self.A.abs(), z.abs().to(torch.float64).unsqueeze(-2)) + self.b.abs()
-        return (ROUND_OFF * sizes / self.norms()).detach()
+        A, b, norms = self._scaled()
+        sizes = dot(A.abs(), z.abs().to(torch.float64).unsqueeze(-2)) + b.abs()
+        return (ROUND_OFF * sizes / norms).detach()
+
+    def _scaled(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The rows, exactly scaled to about unit length by powers of two, and their norms then."""
+        scale = power_of_two(self.A)
+        A = self.A / scale.unsqueeze(-1)
+        return A, self.b / scale, _root_of_squares(A)
 
     def contains(self, z: Float[Tensor, "*batch n"], tolerance: float = 0.0) -> Bool[Tensor, "*batch"]:
         """Is z inside, up to a distance `tolerance` (units of z)?"""
@@ -112,6 +118,25 @@ def dot(v: Float[Tensor, "*#batch n"], w: Float[Tensor, "*#batch n"]) -> Float[T
     """v.w, faster than a product of many small matrices, and rounded alike in every batch."""
     products = (v * w).unbind(-1) if v.shape[-1] else (torch.zeros_like(v).sum(-1),)
     return sum(products[1:], start=products[0])
+
+
+def lengths(rows: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    """|a|, with 1 for zero rows: no square leaves the floating-point numbers, and the gradient is finite everywhere."""
+    scale = power_of_two(rows)
+    return scale * _root_of_squares(rows / scale.unsqueeze(-1))
+
+
+def power_of_two(rows: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    """A power of two about as large as the largest entry of each row; 1 for zero rows and rows that are not finite."""
+    largest = rows.detach().abs().amax(-1) if rows.shape[-1] else rows.detach().sum(-1)
+    scale = largest / (2 * torch.frexp(largest).mantissa)
+    return torch.where((largest > 0) & scale.isfinite() & (scale > 0), scale, 1.0)
+
+
+def _root_of_squares(rows: Tensor) -> Tensor:
+    squared = dot(rows, rows)
+    padding = squared == 0
+    return torch.where(padding, 1.0, squared.masked_fill(padding, 1.0).sqrt())
 
 
 def finite(*tensors: Tensor) -> bool:

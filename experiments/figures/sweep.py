@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 from experiments.figures.style import HYBRID, INVERSE_OPTIMAL, REGION, UKF
 from experiments.results import Columns
 from experiments.sweeps.config import SweepConfig
-from experiments.sweeps.swept import Swept, short
+from experiments.sweeps.swept import Swept, quantiles, short
 
 BAND = (0.1, 0.9)
 LEGEND_WIDTH = 1.6
@@ -88,8 +88,8 @@ def _draw_containment(axes: Axes, series: Columns) -> None:
 def _draw_lengths(axes: Axes, series: Columns, measures: tuple[tuple[str, str, str], ...]) -> None:
     t = np.unique(series["t"])
     for name, _, colour in measures:
-        values = [series[name][series["t"] == at] for at in t]
-        low, middle, high = (np.array([np.nanquantile(of, q) for of in values]) for q in (BAND[0], 0.5, BAND[1]))
+        of_times = [quantiles(series[name][series["t"] == at], (BAND[0], 0.5, BAND[1])) for at in t]
+        low, middle, high = np.array(of_times).T
         axes.fill_between(t, low, high, color=colour, alpha=0.2, lw=0)
         axes.semilogy(t, middle, color=colour, lw=1.8)
     axes.set(xlim=(t[0], t[-1]))

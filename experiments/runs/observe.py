@@ -57,7 +57,10 @@ def _regions(recording: Recording, measurement: Measurement, sets: dict[str, Set
 
 
 def _distinct(vertices: Tensor) -> Tensor:
-    """Padding repeats the first vertex at the end."""
+    """Padding repeats the first vertex at the end; an empty set has none."""
+    vertices = vertices[vertices.isfinite().all(-1)]
+    if len(vertices) == 0:
+        return vertices
     padding = (vertices == vertices[0]).all(-1)
     padding[0] = False
     return vertices[~padding]

@@ -84,8 +84,9 @@ def settings(config: ExperimentConfig) -> dict[str, Any]:
 
 
 def stays_below(t: np.ndarray, values: np.ndarray, bound: float) -> float | None:
-    """The first time from which on a value stays below a bound; None if it does not at the end."""
-    above = np.flatnonzero(values >= bound)
+    """The first time from which on a value stays below a bound; None if it does not at the end. NaN, that of an empty
+    set, is not below."""
+    above = np.flatnonzero(~(values < bound))
     first = above[-1] + 1 if len(above) else 0
     return float(t[first]) if first < len(t) else None
 

@@ -104,7 +104,7 @@ def measurements(
     before = torch.zeros_like(starts)
     for sample in closed_loop(controller, goals, starts, among_nearest, dt=config.dt, samples=config.steps + 1):
         seen = sample.control.u + in_disc(random, config.measurement_noise.velocity, (config.robots,))
-        measurement = among_nearest(sample.measurement.t, sample.measurement.x, before, seen)
+        measurement = among_nearest(sample.measurement.time, sample.measurement.x, before, seen)
         yield replace(measurement, observed=sample.control.feasible), sample
         before = seen
 

@@ -53,7 +53,7 @@ def observed(scene: SceneConfig, times: tuple[float, ...]) -> dict[str, Any]:
         if k in kept or k == recording.samples - 1:
             sizes = _sizes(estimate, sets, recording.goals)
         if k in kept:
-            series += _series(measurement.t, recording.robots, sizes, sets, observers)
+            series += _series(measurement.time, recording.robots, sizes, sets, observers)
     shares = (cases / cases.sum()).tolist()
     stopped = [t for t in simulated.true.deadlocked_since.tolist() if not math.isnan(t)]
     row = {
@@ -67,7 +67,7 @@ def observed(scene: SceneConfig, times: tuple[float, ...]) -> dict[str, Any]:
     }
     for kind in SETS:
         row |= {f"{kind}_{name}": value for name, value in _of_set(observers, kind, lost_since[kind]).items()}
-    row |= {name: _rounded(float(values.median())) for name, values in sizes.items()}
+    row |= {name: _rounded(float(values.nanmedian())) for name, values in sizes.items()}
     return {"row": row, "series": series, "seconds": round(time.perf_counter() - began, 3)}
 
 

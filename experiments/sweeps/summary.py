@@ -12,7 +12,7 @@ from rich.console import Console
 from experiments.figures.style import length
 from experiments.runs.saved import SETS
 from experiments.sweeps.config import SweepConfig
-from experiments.sweeps.swept import Swept, short
+from experiments.sweeps.swept import Swept, quantiles, short
 from experiments.tables import table
 
 SIZES = ("sqrt_area", "diameter", "centroid_error")
@@ -59,7 +59,8 @@ def _mean(values: np.ndarray, weights: np.ndarray) -> float | None:
 
 
 def _quantiles(values: np.ndarray) -> list[float] | None:
-    return [float(f"{x:.4g}") for x in np.nanquantile(values, QUANTILES)] if len(values) else None
+    found = quantiles(values, QUANTILES)
+    return None if np.isnan(found).any() else [float(f"{x:.4g}") for x in found]
 
 
 def print_sweep(summary: dict[str, Any], console: Console) -> None:

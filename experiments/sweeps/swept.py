@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -69,6 +70,12 @@ class Swept:
         """The values of these keys, entry by entry."""
         keys = self.telling(axis)
         return [[_value(key, level[key]) for key in keys] for level in self.config.axes[axis]]
+
+
+def quantiles(values: np.ndarray, at: Sequence[float]) -> np.ndarray:
+    """Of the finite values: the others are of empty sets. NaN without any."""
+    finite = values[np.isfinite(values)]
+    return np.quantile(finite, at) if len(finite) else np.full(len(at), np.nan)
 
 
 def short(key: str) -> str:

@@ -31,8 +31,11 @@ class Fault:
     """Samples of a robot at odds with the declared bounds because of one row of the model.
 
     Attributes:
-        row: its label. soft: it may be violated.
-        samples: how many. first: the time of the first [s]. worst: the most that a bound is exceeded by [m/s].
+        row: its label.
+        soft: the controller may violate it.
+        samples: how many there are.
+        first: the time of the first [s].
+        worst: the most by which a bound is exceeded [m/s].
     """
 
     row: str
@@ -51,8 +54,9 @@ class RobotCheck:
 
     Attributes:
         smallest_bound: the smallest velocity bound that explains the motion.
-        median, p95, worst, worst_time: of the residuals of the samples, and when the worst was.
-        samples: that say something.
+        median, p95, worst: quantiles of the residuals of its samples.
+        worst_time: when the worst was [s].
+        samples: how many say something about theta.
         contradictions: samples that the best Theta cannot explain with the declared bound.
         violations: rows violated beyond their bound.
     """
@@ -73,10 +77,10 @@ class Check:
     """A log against its declared model.
 
     Attributes:
-        declared: the velocity bound of the configuration [m/s], or what `auto` would take; `is_auto` tells.
+        declared: the velocity bound of the configuration [m/s], or what `auto` would take.
+        is_auto: the configuration says `auto`.
         fastest: the largest speed in the log [m/s].
-        smallest_bound: the largest of the robots' smallest bounds [m/s].
-        shifts: the same if velocities are taken so many samples later; infinite: not below that of no shift.
+        shifts: `smallest_bound` if velocities are taken so many samples later; infinite: not below that of no shift.
     """
 
     robots: tuple[RobotCheck, ...]
@@ -87,10 +91,12 @@ class Check:
 
     @property
     def smallest_bound(self) -> float:
+        """The largest of the robots' smallest bounds [m/s]."""
         return max(robot.smallest_bound for robot in self.robots)
 
     @property
     def best_shift(self) -> int:
+        """How many samples later the velocities fit clearly better; 0: aligned as they are."""
         best = min(self.shifts, key=lambda shift: self.shifts[shift])
         return best if self.shifts[best] < BETTER * self.smallest_bound else 0
 

@@ -90,9 +90,11 @@ class Hypotheses:
                 verdicts.setdefault(robot, {})[name] = HypothesisVerdict(
                     status=STATUS_NAMES[Status(int(observation.sets.status[i]))],
                     refuted_at=float(events[0].t) if events else None,
-                    evidence=tuple(
-                        (None if math.isnan(time) else time, constraint_name(source, labels)) for time, source in rows
-                    ),
+                    evidence=tuple((_or_none(float(time)), constraint_name(source, labels)) for time, source in rows),
                     volume=volumes[i],
                 )
         return verdicts
+
+
+def _or_none(time: float) -> float | None:
+    return None if math.isnan(time) else time

@@ -83,8 +83,13 @@ def print_check(found: Check, name: str, console: Console) -> None:
         ["samples", "first", "worst [m/s]"],
     )
     for robot in found.robots:
-        sizes = [f"{size:.3g}" for size in (robot.smallest_bound, robot.median, robot.p95, robot.worst)]
-        robots.add_row(escape(robot.robot), *sizes, seconds(robot.worst_time), str(robot.samples))
+        sizes = [_size(size) for size in (robot.smallest_bound, robot.median, robot.p95, robot.worst)]
+        robots.add_row(
+            escape(robot.robot),
+            *sizes,
+            "-" if math.isnan(robot.worst_time) else seconds(robot.worst_time),
+            str(robot.samples),
+        )
         for what, listed in (("unexplained", robot.contradictions), ("violated", robot.violations)):
             for fault in listed:
                 row = escape(f"{fault.row} (soft)" if fault.soft else fault.row)
@@ -117,8 +122,8 @@ def _status(status: str) -> str:
 
 
 def _size(value: float) -> str:
-    """A size; nothing of an empty set."""
-    return f"{value:.3g}" if math.isfinite(value) else "-"
+    """A size; a dash where there is none, as of an empty set."""
+    return "-" if math.isnan(value) else f"{value:.3g}"
 
 
 def _point(values: Sequence[float], verdict: Verdict) -> str:

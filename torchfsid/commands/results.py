@@ -157,8 +157,8 @@ class _Descriptions:
 
 
 def seconds(t: float) -> str:
-    """A time as text, with its milliseconds also where it is counted from 1970."""
-    return f"{t:.13g} s"
+    """A time as text, to a tenth of a millisecond, also where it is counted from 1970."""
+    return f"{round(t, 4):.15g} s"
 
 
 def constraint_name(source: int, labels: Sequence[str]) -> str:
@@ -203,7 +203,7 @@ def regions(robots: Sequence[str], observer: SetMembershipObserver) -> dict:
                     "t": float(event.t),
                     "status": STATUS_NAMES[event.status],
                     "reset": event.reset,
-                    "rows": [{"time": time, "source": source} for time, source in event.rows],
+                    "rows": [{"time": float(time), "source": source} for time, source in event.rows],
                 }
                 for event in events
             ],

@@ -101,11 +101,12 @@ def status(what: str, computes: bool = False) -> Iterator[None]:
 
 
 def digits(value: float, resolution: float) -> str:
-    """A number with at least four digits, and with as many as tell apart what is a tenth of `resolution` apart."""
-    if not math.isfinite(value):
+    """A number with at least four digits, and with as many as tell apart what is a tenth of `resolution` apart;
+    a dash for NaN, of which there is nothing to say."""
+    if math.isnan(value):
         return "-"
     enough, size = 4, abs(value)
-    if size > 0 and math.isfinite(resolution):
+    if 0 < size < math.inf and math.isfinite(resolution):
         resolution = max(resolution, 1e-12 * size)  # beyond that, digits are round-off
         enough = max(4, 2 + math.floor(math.log10(size)) - math.floor(math.log10(resolution)))
     return f"{value:.{enough}g}"

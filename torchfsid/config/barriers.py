@@ -1,6 +1,6 @@
 """The barriers in configuration files, and the objects of `robots.barriers` that they stand for.
 
-Each answers for itself what a log must hold for it: does it use the bodies' radii, and which of their velocities?
+Each answers for itself what a log must hold for it: the bodies' radii, their velocities now or one sample earlier.
 """
 
 from __future__ import annotations
@@ -68,7 +68,6 @@ class AvoidanceConfig(Strict):
 
     @property
     def uses_radius(self) -> bool:
-        """Do the rows depend on the bodies' radii?"""
         return self.margin is not None
 
     def require_radii(self, radius: Sequence[float] | None) -> None:
@@ -94,9 +93,7 @@ class AvoidanceConfig(Strict):
 
 
 class _RobotsOwn(Strict):
-    """Rows that do not depend on other bodies. `soft`: the controller may violate them."""
-
-    soft: Flag = False
+    """Rows that do not depend on other bodies."""
 
     @property
     def uses_radius(self) -> bool:
@@ -115,6 +112,7 @@ class SpeedBoxConfig(_RobotsOwn):
 
     kind: Literal["speed_box"] = "speed_box"
     limit: Annotated[tuple[Positive, ...], Field(min_length=2, max_length=2)]
+    soft: Flag = False
 
     def build(self, bodies: Sequence[str]) -> Barrier:
         from torchfsid.robots.barriers import SpeedBox
@@ -128,6 +126,7 @@ class SpeedPolygonConfig(_RobotsOwn):
     kind: Literal["speed_polygon"] = "speed_polygon"
     sides: Annotated[int, Field(strict=True, ge=3, le=360)]
     limit: Positive
+    soft: Flag = False
 
     def build(self, bodies: Sequence[str]) -> Barrier:
         from torchfsid.robots.barriers import SpeedPolygon
@@ -143,6 +142,7 @@ class ArenaConfig(_RobotsOwn):
     upper: PlanarVector
     margin: NonNegative = 0.0
     class_k: ClassKConfig
+    soft: Flag = False
 
     @model_validator(mode="after")
     def _is_a_box(self) -> ArenaConfig:

@@ -82,11 +82,6 @@ class ObserveConfig(Strict):
         return frozenset(barrier.neighbour_velocity for barrier in self.barriers) - {"none"}
 
     @property
-    def uses_radius(self) -> bool:
-        """Does a barrier need the bodies' radii?"""
-        return any(barrier.uses_radius for barrier in self.barriers)
-
-    @property
     def required(self) -> tuple[str, ...]:
         """The bodies without which a measurement says nothing about theta: the leader of a formation."""
         return self.task.required

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchfsid.halfspaces import Halfspaces
+from torchfsid.halfspaces import Halfspaces, dot
 from torchfsid.identification.kkt import KktSolution, outward_normals, solve_kkt
 from torchfsid.tolerances import CRITICAL_NORMALS, RANK_TOLERANCE
 
@@ -39,7 +39,8 @@ def region_of(
 ) -> Halfspaces:
     """`critical_region` of unit rows whose KKT conditions are solved."""
     # A row inside the span of the active rows cannot see theta: u* does not move along it.
-    sees_theta = (unit.A.detach() @ kkt.free.detach()).square().sum(-1) > RANK_TOLERANCE**2
+    across = unit.A.detach() @ kkt.free.detach()
+    sees_theta = dot(across, across) > RANK_TOLERANCE**2
     # C theta + d - u* = P (C theta + d - A_a^+ b_a) lies in the span of the active rows: normals across it say nothing.
     normals, generator = outward_normals(unit.A, kkt.active, CRITICAL_NORMALS)
     along = normals @ kkt.projector
@@ -49,5 +50,5 @@ def region_of(
     rows = torch.cat([unit.A @ motion, along @ push], dim=-2)
     bounds = torch.nn.functional.pad(unit.b, (0, along.shape[-2]))
     return Halfspaces(rows[..., :-1], bounds - rows[..., -1], torch.cat([j, unit.rows + generator], dim=-1)).where(
-        torch.cat([sees_theta & ~kkt.active, along.square().sum(-1) > RANK_TOLERANCE**2], dim=-1)
+        torch.cat([sees_theta & ~kkt.active, dot(along, along) > RANK_TOLERANCE**2], dim=-1)
     )

@@ -152,38 +152,38 @@ def evidence(
 
 
 def _sample(model: ObservationModel, theta: FeasibleSet, measurement: Measurement) -> _Sample:
-    u, x = measurement.u, measurement.x
-    assert u is not None
-    robots = theta.batch_shape[0] if len(theta.batch_shape) == 1 else 0
-    if x.ndim != 2 or len(x) != robots * (len(x) // max(robots, 1)):
-        raise InputError("measurement", f"a batch of {tuple(theta.batch_shape)} robots, or several", tuple(x.shape))
+    assert measurement.u is not None
+    robots, items, u = theta.batch_shape.numel(), len(measurement.x), measurement.u.to(torch.float64)
+    if measurement.x.ndim != 2 or len(theta.batch_shape) != 1 or items % max(robots, 1) != 0:
+        expected = f"a batch of {tuple(theta.batch_shape)} robots, or several of them"
+        raise InputError("measurement", expected, tuple(measurement.x.shape))
     parts = [barrier(measurement) for barrier in model.barriers]
     rows, (C, d) = Halfspaces.stack(parts), model.task(measurement)
     soft = [b.soft for b, part in zip(model.barriers, parts, strict=True) for _ in range(part.rows)]
 
     noise = NoiseBound(0.0, model.active_tolerance) if model.noise is None else model.noise
-    bound, ball, drift = per_row(noise.slack, x), per_row(noise.velocity, x).squeeze(-1), x.new_zeros(())
-    errors, of_rows, corners = ErrorBounds.of(measurement, model.noise), None, None
+    bound, ball, drift = per_row(noise.slack, u), per_row(noise.velocity, u).squeeze(-1), u.new_zeros(())
     if measurement.velocity_error is not None:
         bound, ball = bound + measurement.velocity_error.unsqueeze(-1), ball + measurement.velocity_error
+    largest = bound.squeeze(-1)  # slack of an active row whose position is exact
+    errors, of_rows, corners = ErrorBounds.of(measurement, model.noise), None, None
     if errors is not None or model.task.saturation is not None:
-        corners = theta.vertices().repeat(len(x) // robots, 1, 1)
-    if errors is not None and corners is not None:
-        of_rows = row_errors(model.barriers, parts, measurement, errors)
-        bound, drift = bound + of_rows.slack, model.task.drift(errors, corners.abs().amax(-2))
-
-    usable = ~controller_failed(model.barriers, measurement, rows)
+        corners = theta.vertices().repeat(items // max(robots, 1), 1, 1)
+        if errors is not None:
+            of_rows = row_errors(model.barriers, parts, measurement, errors)
+            bound, drift = bound + of_rows.slack, model.task.drift(errors, corners.abs().amax(-2))
+    usable = ~controller_failed(model.barriers, measurement, rows, of_rows)
     if measurement.observed is not None:
         usable = usable & measurement.observed
     if measurement.left_out is not None:
-        nearest, error = per_row(noise.slack, x).squeeze(-1) + noise.neighbour_velocity, 2 * noise.position
-        if measurement.velocity_error is not None:
-            nearest = nearest + measurement.velocity_error
-        error = x.new_tensor(error) + (0.0 if measurement.position_error is None else measurement.position_error)
-        usable = usable & left_out_inactive(model.barriers, measurement, nearest, error)
+        error = u.new_tensor(2 * noise.position)
+        if measurement.position_error is not None:
+            error = error + measurement.position_error
+        usable = usable & left_out_inactive(model.barriers, measurement, largest + noise.neighbour_velocity, error)
+
     return _Sample(
-        rows, ~torch.tensor(soft, dtype=torch.bool, device=x.device), u.to(torch.float64), C.to(torch.float64),
-        d.to(torch.float64), usable, bound, ball, drift, of_rows, corners,
+        rows, ~torch.tensor(soft, dtype=torch.bool, device=u.device), u, C.to(torch.float64), d.to(torch.float64),
+        usable, bound, ball, drift, of_rows, corners,
     )  # fmt: skip
 
 

@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchfsid.errors import InputError
-from torchfsid.halfspaces import Halfspaces
+from torchfsid.halfspaces import Halfspaces, dot
 from torchfsid.identification.kkt import outward_normals
 from torchfsid.identification.saturation import unclipped
 from torchfsid.robots.bounds import NoiseBound, RowErrors
@@ -101,10 +101,10 @@ def set_around(
     needed = (normals != 0).any(-1)
     room = (ball + drift).unsqueeze(-1)
     if saturation is None:
-        return Halfspaces(normals @ C, torch.where(needed, _along(normals, u - d) + room, 1.0), source)
+        return Halfspaces(normals @ C, (dot(normals, (u - d).unsqueeze(-2)) + room).masked_fill(~needed, 1.0), source)
     if possible is None:
         raise InputError("possible", "the nominal controls that are still possible, for a saturation", None)
-    nominal = Halfspaces(normals, _along(normals, u) + ball.unsqueeze(-1), source).where(needed)
+    nominal = Halfspaces(normals, dot(normals, u.unsqueeze(-2)) + ball.unsqueeze(-1), source).where(needed)
     nominal = unclipped(nominal, saturation, possible, drift)
     is_row = (nominal.A != 0).any(-1)
     return Halfspaces(nominal.A, nominal.b + drift.unsqueeze(-1) * is_row, nominal.source).pullback(C, d)
@@ -113,10 +113,6 @@ def set_around(
 def without_direction(unit: Halfspaces, row_errors: RowErrors) -> Bool[Tensor, "*batch m"]:
     """Rows that may point anywhere: turned by up to pi, or vanished where errors could have turned them."""
     return (row_errors.angle >= math.pi) | ((row_errors.angle > 0) & (unit.A == 0).all(-1))
-
-
-def _along(normals: Float[Tensor, "*batch k n"], v: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch k"]:
-    return (normals @ v.unsqueeze(-1)).squeeze(-1)
 
 
 def per_row(bound: float | Float[Tensor, "*batch"], like: Tensor) -> Float[Tensor, "*batch 1"]:

@@ -33,7 +33,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchfsid.errors import InputError
-from torchfsid.halfspaces import Halfspaces
+from torchfsid.halfspaces import Halfspaces, dot
 from torchfsid.tolerances import ANGLE_TOLERANCE, RANK_TOLERANCE
 
 CASES = "ABCDE"
@@ -90,13 +90,12 @@ def solve_unit(
 ) -> KktSolution:
     """`solve_kkt` of unit rows."""
     n, p = unit.dim, C.shape[-1]
-    A = torch.where(active.unsqueeze(-1), unit.A, 0.0)
-    b = torch.where(active, unit.b, 0.0)
+    A, b = unit.A.masked_fill(~active.unsqueeze(-1), 0.0), unit.b.masked_fill(~active, 0.0)
 
     offset, projector, rank = _solve_planar(A, b) if n == 2 else _solve(A, b)
     identity = torch.eye(n, dtype=A.dtype, device=A.device)
     # At full rank nothing of theta gets through: exactly nothing, not a rounding error of I - P.
-    free = torch.where((rank == n)[..., None, None], 0.0, identity - projector)
+    free = (identity - projector).masked_fill((rank == n)[..., None, None], 0.0)
     through = free @ torch.cat([C, d.unsqueeze(-1)], dim=-1)
 
     n_active = active.sum(-1)
@@ -123,13 +122,12 @@ def _solve(A: Float[Tensor, "*batch m n"], b: Float[Tensor, "*batch m"]) -> tupl
 
 def _solve_planar(A: Float[Tensor, "*batch m 2"], b: Float[Tensor, "*batch m"]) -> tuple[Tensor, Tensor, Tensor]:
     """A^+ b, A^+ A and the rank; the rows are unit rows or zero."""
-    y, across, rank = _principal_axes(A.detach())
+    y, size, across, rank = _principal_axes(A.detach())
     full = (rank == 2)[..., None, None]
     # Rank 1: the rows' direction, by a step of the power iteration from where it has converged, which has its gradient.
     direction = (A.mT @ y.unsqueeze(-1)).squeeze(-1)
-    length = torch.where(rank == 0, 1.0, direction.square().sum(-1)).sqrt()
+    length = dot(direction, direction).masked_fill(rank == 0, 1.0).sqrt()
     direction = direction / length.unsqueeze(-1)
-    size = torch.where(rank == 0, 1.0, y.square().sum(-1)).sqrt()
     along = direction / size.unsqueeze(-1)
     W = torch.stack([torch.where(full[..., 0], along.detach(), along), across], dim=-1)
 
@@ -144,9 +142,9 @@ def _solve_planar(A: Float[Tensor, "*batch m 2"], b: Float[Tensor, "*batch m"]) 
 
 
 @torch.no_grad()
-def _principal_axes(A: Float[Tensor, "*batch m 2"]) -> tuple[Tensor, Tensor, Int[Tensor, "*batch"]]:
-    """For rows A: y = A v_1 with v_1 the first principal axis; the second axis over its singular value, or zero at a
-    lower rank; and the rank."""
+def _principal_axes(A: Float[Tensor, "*batch m 2"]) -> tuple[Tensor, Tensor, Tensor, Int[Tensor, "*batch"]]:
+    """Of rows A: y = A v_1 with v_1 the first principal axis; the first singular value |y| (1: no row); the second
+    axis over its singular value (zero at a lower rank); and the rank."""
     first, second = A.unbind(-1)
     turn = torch.atan2(2 * (first * second).sum(-1), ((first + second) * (first - second)).sum(-1)) / 2
     cos, sin = turn.cos().unsqueeze(-1), turn.sin().unsqueeze(-1)
@@ -158,7 +156,7 @@ def _principal_axes(A: Float[Tensor, "*batch m 2"]) -> tuple[Tensor, Tensor, Int
     full = ww > RANK_TOLERANCE**2 * yy
     across = torch.cat([-sin - cos * share, cos - sin * share], dim=-1) * torch.where(full, ww, 1.0).rsqrt()
     rank = torch.where(full, 2, torch.where(none, 0, 1)).squeeze(-1)
-    return y, torch.where(full, across, 0.0), rank
+    return y, yy.masked_fill(none, 1.0).sqrt().squeeze(-1), across.masked_fill(~full, 0.0), rank
 
 
 class OutwardNormals(NamedTuple):
@@ -192,10 +190,11 @@ def outward_normals(
 
     # The rows at the ends of the gaps were found without gradients; the normals are theirs, with gradients.
     ends = generators.gather(-2, gaps.ends.unsqueeze(-1).expand(*shape, 3, 2))
-    ends = torch.where(gaps.some.unsqueeze(-1), ends, 1.0)
+    none = ~gaps.some
+    ends = ends.masked_fill(none.unsqueeze(-1), 1.0)
     first, last, second = torch.atan2(ends[..., 1], ends[..., 0]).unsqueeze(-1).unbind(-2)
-    opening = torch.where(gaps.some, last - first + gaps.turns - math.pi, 2 * math.pi)
-    start = torch.where(gaps.some, first + math.pi / 2, 0.0)
+    opening = (last - first + (gaps.turns - math.pi)).masked_fill(none, 2 * math.pi)
+    start = (first + math.pi / 2).masked_fill(none, 0.0)
     step = torch.linspace(0.0, 1.0, fan, dtype=generators.dtype, device=generators.device)
     angles = torch.cat([start + step * opening.clamp(min=0), second + math.pi / 2], dim=-1)
     normals = torch.stack([angles.cos(), angles.sin()], dim=-1)
@@ -204,7 +203,7 @@ def outward_normals(
     needed = torch.cat([inner, gaps.is_line], dim=-1)
     from_first, from_last, from_second = gaps.ends.unsqueeze(-1).unbind(-2)
     near = torch.cat([torch.where(step < 0.5, from_first, from_last), from_second], dim=-1)
-    return OutwardNormals(torch.where(needed.unsqueeze(-1), normals, 0.0), torch.where(gaps.some, near, m))
+    return OutwardNormals(normals.masked_fill(~needed.unsqueeze(-1), 0.0), near.masked_fill(none, m))
 
 
 class _Gaps(NamedTuple):

@@ -7,7 +7,7 @@ The rows a_j are unit ones. Both are dual active-set methods: every iterate solv
 row that it violates most enters, until none is violated.
 
 The nearest point is found after Goldfarb and Idnani (Math. Programming 27, 1983). The active rows are made orthogonal
-one by one, a_s = sum_i R_is Q_i with R_ss = 1. An entering row n is n = sum_s c_s a_s + d, d orthogonal to all of them.
+one by one, a_s = Q_s + sum_i<s T_si Q_i. An entering row n is n = sum_s c_s a_s + d, d orthogonal to all of them.
 Pushing it by t changes the multipliers by -t c and its violation by -t |d|^2. A multiplier that reaches zero first
 leaves. If d = 0 and no multiplier can leave, then n - sum_s c_s a_s = 0 is a combination of rows with weights >= 0 whose
 bounds contradict each other: the set is empty.
@@ -47,40 +47,70 @@ def dot(v, w):
 @item
 @no_type_check
 def orthogonalise(v, Q, D, k, share):
-    """Take from v what lies in the span of the first k rows of Q, twice, so that round-off is gone; share_i of Q_i."""
+    """Take from v what lies in the span of the first k rows of Q: v loses share_i Q_i. D_i = 1 / |Q_i|^2.
+
+    Twice, if little is left, so that what is left is orthogonal to round-off.
+
+    Returns:
+        |v|^2, of what is left.
+    """
+    square, left = 0, 0
+    for j in range(len(v)):
+        square += v[j] * v[j]
     for i in range(k):
         share[i] = 0
     for _ in range(2):
         for i in range(k):
-            part = dot(Q[i], v) / D[i]
+            part = 0
+            for j in range(len(v)):
+                part += Q[i, j] * v[j]
+            part *= D[i]
             share[i] += part
             for j in range(len(v)):
                 v[j] -= part * Q[i, j]
+        left = 0
+        for j in range(len(v)):
+            left += v[j] * v[j]
+        if k == 0 or 4 * left > square:
+            break
+    return left
 
 
 @item
 @no_type_check
-def solve_upper(R, right, k, x):
-    """R x = right for the unit upper triangular R, of which only what lies above the diagonal is read."""
+def solve_upper(T, right, k, x):
+    """sum_s x_s a_s = sum_i right_i Q_i for the k rows a_s = Q_s + sum_i<s T_si Q_i."""
     for i in range(k - 1, -1, -1):
         x[i] = right[i]
         for j in range(i + 1, k):
-            x[i] -= R[i, j] * x[j]
+            x[i] -= T[j, i] * x[j]
 
 
 @item
 @no_type_check
-def on_rows(b, Q, D, R, k, y, z):
-    """z = sum_i y_i Q_i with a_s.z = b_s for the k rows behind Q, R."""
+def on_rows(b, Q, D, T, k, y, z):
+    """z = sum_i y_i Q_i with a_s.z = b_s for the k rows a_s = Q_s + sum_i<s T_si Q_i."""
     for j in range(len(z)):
         z[j] = 0
     for s in range(k):
-        y[s] = b[s]
+        c = b[s]  # y_s |Q_s|^2
         for i in range(s):
-            y[s] -= R[i, s] * D[i] * y[i]
-        y[s] /= D[s]
+            c -= T[s, i] * y[i]
+        y[s] = c
+    for s in range(k):
+        y[s] *= D[s]
         for j in range(len(z)):
             z[j] += y[s] * Q[s, j]
+
+
+@item
+@no_type_check
+def excess(A, b, row, z):
+    """a.z - b of a row."""
+    over = -b[row]
+    for j in range(len(z)):
+        over += A[row, j] * z[j]
+    return over
 
 
 @item
@@ -89,7 +119,7 @@ def most_violated(A, b, z):
     """The row with the largest a.z - b; rows without a bound never."""
     worst, row = -np.inf, -1
     for j in range(len(b)):
-        over = dot(A[j], z) - b[j]
+        over = excess(A, b, j, z)
         if over > worst:
             worst, row = over, j
     return row, worst
@@ -97,7 +127,7 @@ def most_violated(A, b, z):
 
 @item
 @no_type_check
-def nearest_rows(A, b, sizes, epsilon, rows, Q, D, R, work, z):
+def nearest_rows(A, b, sizes, epsilon, rows, Q, D, T, work, z):
     """The point z nearest to the origin, and its active rows.
 
     Args:
@@ -106,7 +136,9 @@ def nearest_rows(A, b, sizes, epsilon, rows, Q, D, R, work, z):
         sizes: (m,), the size of the numbers that each b was computed from: its round-off is ROUND_OFF times that.
         epsilon: the round-off of the arithmetic.
         rows: (p,), to be filled with the active rows.
-        Q, R: (p, p), scratch. D: (p,), scratch. work: (6, p), scratch.
+        Q, T: (p, p), scratch.
+        D: (p,), scratch.
+        work: (6, p), scratch.
         z: (p,), to be filled with the point.
 
     Returns:
@@ -118,7 +150,7 @@ def nearest_rows(A, b, sizes, epsilon, rows, Q, D, R, work, z):
     for _ in range(MOST_ROUNDS * (m + p)):
         for s in range(k):
             right[s] = b[rows[s]]
-        on_rows(right, Q, D, R, k, y, z)
+        on_rows(right, Q, D, T, k, y, z)
         fresh = q < 0
         if fresh:
             q, _ = most_violated(A, b, z)
@@ -128,15 +160,14 @@ def nearest_rows(A, b, sizes, epsilon, rows, Q, D, R, work, z):
         # The entering row n = sum_s c_s a_s + d, pushed by `push` so far.
         for j in range(p):
             d[j] = A[q, j]
-        orthogonalise(d, Q, D, k, e)
-        solve_upper(R, e, k, c)
-        slope = dot(d, d)
+        slope = orthogonalise(d, Q, D, k, e)
+        solve_upper(T, e, k, c)
         for j in range(p):
             z[j] -= push * d[j]
         for s in range(k):
             y[s] = -(y[s] + push * e[s])
-        solve_upper(R, y, k, held)
-        over = dot(A[q], z) - b[q]
+        solve_upper(T, y, k, held)
+        over = excess(A, b, q, z)
 
         size, coordinates, propagated = 0, 1, push * slope
         for j in range(p):
@@ -160,14 +191,13 @@ def nearest_rows(A, b, sizes, epsilon, rows, Q, D, R, work, z):
                 rows[s] = rows[s + 1]
                 for j in range(p):
                     Q[s, j] = A[rows[s], j]
-                orthogonalise(Q[s], Q, D, s, R[:, s])
-                D[s] = dot(Q[s], Q[s])
+                D[s] = 1 / orthogonalise(Q[s], Q, D, s, T[s])
         elif apart:
-            rows[k], D[k] = q, slope
+            rows[k], D[k] = q, 1 / slope
             for j in range(p):
                 Q[k, j] = d[j]
             for s in range(k):
-                R[s, k] = e[s]
+                T[k, s] = e[s]
             k += 1
             q = -1
         elif over > noise and (epsilon == 0 or over > CLEARLY_EMPTY * noise):
@@ -220,14 +250,14 @@ def inscribed_rows(A, b, simplex, epsilon, basis, M, V, work, able):
         epsilon: the round-off of the arithmetic.
         basis: (p + 1,), to be filled with the rows; m and above: sides of the simplex.
         M, V: (p + 1, p + 1), to be filled; V is the inverse of the rows (a, 1), its last row the multipliers.
-        work: (4, p + 1), to be filled: right, share, w, far.
+        work: (5, p + 1), to be filled: right, share, w, far, scratch.
         able: (p + 1,), scratch of booleans.
 
     Returns:
         Did the search end?
     """
     m, n = A.shape
-    right, share, w, far = work[0], work[1], work[2], work[3]
+    right, share, w, far, noise = work[0], work[1], work[2], work[3], work[4]
     for s in range(n):
         basis[s] = m + s
     for _ in range(MOST_ROUNDS * (m + n)):
@@ -242,14 +272,14 @@ def inscribed_rows(A, b, simplex, epsilon, basis, M, V, work, able):
             return False
         for i in range(n):
             w[i], far[i] = dot(V[i], right), 0
-            for s in range(n):
-                if basis[s] >= m:
-                    far[i] += V[i, s]
+            if is_open:
+                for s in range(n):
+                    if basis[s] >= m:
+                        far[i] += V[i, s]
         for s in range(n):  # one correction: the rows of a sharp corner hold to round-off then
             share[s] = right[s] - dot(A[basis[s]] if basis[s] < m else simplex[basis[s] - m], w)
         for i in range(n):
             w[i] += dot(V[i], share)
-
         q, worst = -1, -np.inf
         if is_open:  # infinitely violated rows come first, infinitely slack ones never
             reach, fastest = 0, 0
@@ -261,7 +291,7 @@ def inscribed_rows(A, b, simplex, epsilon, basis, M, V, work, able):
                     if rate > epsilon * reach and rate > fastest:
                         q, worst, fastest = j, np.inf, rate
                     elif fastest == 0 and rate >= -epsilon * reach:
-                        over = dot(A[j], w) - b[j]
+                        over = excess(A, b, j, w)
                         if over > worst:
                             q, worst = j, over
         else:
@@ -271,17 +301,19 @@ def inscribed_rows(A, b, simplex, epsilon, basis, M, V, work, able):
         size, spread, propagated = 0, 0, 0
         for i in range(n):
             size += abs(w[i])
-            for s in range(n):
-                spread += abs(A[q, i] * V[i, s])
         for s in range(n):
             share[s], largest = 0, 0
             for j in range(n):
-                share[s] += A[q, j] * V[j, s]
-                largest = max(largest, abs(V[j, s]))
-            able[s] = share[s] > epsilon * spread * largest
+                part, entry = A[q, j] * V[j, s], abs(V[j, s])
+                share[s] += part
+                spread += abs(part)
+                largest = entry if entry > largest else largest
+            noise[s] = largest
             propagated += abs(share[s]) * (size + abs(right[s]))
         if worst <= ROUND_OFF * (size + abs(b[q])) + epsilon * propagated:
             return True
+        for s in range(n):
+            able[s] = share[s] > epsilon * spread * noise[s]
         slot = leaving(V, share, able, epsilon)
         if slot < 0:
             return False

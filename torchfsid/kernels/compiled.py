@@ -30,7 +30,7 @@ _OPTIONS: dict[str, Any] = {"error_model": "numpy"}  # a division by zero is inf
 
 def item(function: Callable) -> Any:
     """A function of one item: compiled into every launcher that calls it."""
-    return register_jitable(**_OPTIONS)(function)
+    return register_jitable(**_OPTIONS, _nrt=False)(function)
 
 
 def item_of_ordered(function: Callable) -> Any:

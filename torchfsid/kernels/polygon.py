@@ -68,6 +68,18 @@ def mark_cuts(vertices, k, n, reach, A, b, tolerance, depth, cutting):
     return found
 
 
+@item_of_ordered
+@no_type_check
+def _excess(ring, n, p, q, c, over):
+    """(p, q).v - c of each vertex into `over`; the largest of them."""
+    most = -np.inf
+    for i in range(n):
+        beyond = p * ring[i, 0] + q * ring[i, 1] - c
+        over[i] = beyond
+        most = beyond if beyond > most else most
+    return most
+
+
 @item
 @no_type_check
 def cut_ring(ring, edge, n, lines, first_row, reach, tolerance, depth, cutting, over, spare, spare_edge):
@@ -86,13 +98,12 @@ def cut_ring(ring, edge, n, lines, first_row, reach, tolerance, depth, cutting, 
         if row < 0:
             return n, outcome, shrunk, -1, -1, -1
         cutting[row] = False
-        line, slack, inner, outer = first_row + row, tolerance[row], 0, 0
-        for i in range(n):
-            over[i] = lines[line, 0] * ring[i, 0] + lines[line, 1] * ring[i, 1] - lines[line, 2]
-            inner = i if over[i] < over[inner] else inner
-            outer = i if over[i] > over[outer] else outer
-        if over[outer] <= slack:  # an earlier cut has made it redundant
+        line, slack, inner = first_row + row, tolerance[row], 0
+        most = _excess(ring, n, lines[line, 0], lines[line, 1], lines[line, 2], over)
+        if most <= slack:  # an earlier cut has made it redundant
             continue
+        for i in range(1, n):
+            inner = i if over[i] < over[inner] else inner
         if over[inner] >= -slack:
             before, after = edge[before_in(inner, n)], edge[inner]
             if over[inner] > slack and _contradict(lines, line, before, after, reach):
@@ -103,7 +114,7 @@ def cut_ring(ring, edge, n, lines, first_row, reach, tolerance, depth, cutting, 
             lines[line, 2] += outward
             for i in range(n):
                 over[i] -= outward
-            if over[outer] <= slack:  # the ring is as narrow as round-off
+            if most - outward <= slack:  # the ring is as narrow as round-off
                 continue
             slack = 0.0
         n = _keep_arc(ring, edge, n, line, inner, slack, over, spare, spare_edge)
@@ -245,11 +256,11 @@ def area_of(ring, n):
 def clip(polygons, A, b, stamp, source, first_label, most):
     """Cut all polygons by their rows A (B, R, 2), b and source (B, R), stamped (B,).
 
-    `polygons` are (vertices, A, b, time, source, label, count, reach), as in `Polygon`. New edges are labelled
-    first_label + k R + r, or 0 if `first_label` is 0. Polygons with more than `most` edges are merged, or stay as they
-    were if that costs what the cut has gained.
+    `polygons` are (vertices, A, b, time, source, label, count, reach), as in `Polygon`. New edges are labelled one by
+    one from `first_label` on, `entered` are their rows k R + r; without labels, `first_label` is 0. Polygons with more
+    than `most` edges are merged, or stay as they were if that costs what the cut has gained.
 
-    Returns (polygons, outcome, shrunk, contradiction): the same polygons, not copied, if none was cut.
+    Returns (polygons, outcome, shrunk, entered, contradiction): the same polygons, not copied, if none was cut.
     """
     vertices, ring_A, ring_b, time, ring_source, label, count, reach = polygons
     (B, R), V = b.shape, ring_b.shape[1]
@@ -257,7 +268,8 @@ def clip(polygons, A, b, stamp, source, first_label, most):
     tolerance, depth, cutting, over = np.empty(R), np.empty(R), np.empty(R, np.bool_), np.empty(W)
     ring, spare, lines = np.empty((W, 2)), np.empty((W, 2)), np.empty((W, 3))
     edge, spare_edge = np.empty(W, np.int64), np.empty(W, np.int64)
-    result, slots = polygons, 0
+    result, slots, new = polygons, 0, 0
+    entered = np.empty(B * R if first_label > 0 else 0, np.int64)
     to_vertices, to_A, to_b, to_time, to_source, to_label, to_count, _ = polygons
     outcome, shrunk = np.zeros(B, np.int64), np.zeros(B, np.bool_)
     lost_A, lost_b = np.full((B, 3, 2), np.nan), np.full((B, 3), np.nan)
@@ -270,7 +282,8 @@ def clip(polygons, A, b, stamp, source, first_label, most):
             ring[i, 0], ring[i, 1], edge[i] = vertices[k, i, 0], vertices[k, i, 1], i
             lines[i, 0], lines[i, 1], lines[i, 2] = ring_A[k, i, 0], ring_A[k, i, 1], ring_b[k, i]
         for r in range(R):
-            lines[V + r, 0], lines[V + r, 1], lines[V + r, 2] = A[k, r, 0], A[k, r, 1], b[k, r]
+            if cutting[r]:
+                lines[V + r, 0], lines[V + r, 1], lines[V + r, 2] = A[k, r, 0], A[k, r, 1], b[k, r]
         n, outcome[k], shrunk[k], row, before, after = cut_ring(
             ring, edge, n, lines, V, reach[k], tolerance, depth, cutting, over, spare, spare_edge
         )
@@ -305,11 +318,14 @@ def clip(polygons, A, b, stamp, source, first_label, most):
                 to_time[k, i], to_source[k, i], to_label[k, i] = time[k, e], ring_source[k, e], label[k, e]
             else:
                 to_time[k, i], to_source[k, i] = stamp[k], source[k, e - V]
-                to_label[k, i] = first_label + k * R + e - V if first_label > 0 else 0
-    return result, outcome, shrunk, (lost_A, lost_b, lost_time, lost_source)
+                to_label[k, i] = 0
+                if first_label > 0:
+                    to_label[k, i], entered[new] = first_label + new, k * R + e - V
+                    new += 1
+    return result, outcome, shrunk, entered[:new], (lost_A, lost_b, lost_time, lost_source)
 
 
-@item
+@launcher
 @no_type_check
 def _widened(polygons, slots):
     """A copy with room for `slots` vertices; new slots repeat the first vertex and carry padding rows."""

@@ -19,7 +19,7 @@ from typing import no_type_check
 
 import numpy as np
 
-from torchfsid.kernels.active_rows import dot, inscribed_rows, nearest_rows, on_rows, orthogonalise, solve_upper
+from torchfsid.kernels.active_rows import dot, excess, inscribed_rows, nearest_rows, on_rows, orthogonalise, solve_upper
 from torchfsid.kernels.compiled import item, launcher
 from torchfsid.outcome import ProgrammeStatus
 from torchfsid.tolerances import ROUND_OFF, VERIFIED
@@ -27,21 +27,22 @@ from torchfsid.tolerances import ROUND_OFF, VERIFIED
 OK, EMPTY, UNBOUNDED = int(ProgrammeStatus.OK), int(ProgrammeStatus.EMPTY), int(ProgrammeStatus.UNBOUNDED)
 DEGENERATE, UNDEFINED = int(ProgrammeStatus.DEGENERATE), int(ProgrammeStatus.UNDEFINED)
 UNSOLVED = int(ProgrammeStatus.UNSOLVED)
-IMPOSSIBLE, BOUNDLESS = (
-    -1,
-    -2,
-)  # EMPTY by a row 0.z <= b < 0, and UNBOUNDED for want of a largest ball: no finite radius
+SHORT, LONG = 1e-100, 1e100
+IMPOSSIBLE, BOUNDLESS = -1, -2  # EMPTY by a row 0.z <= b < 0, and UNBOUNDED for want of a largest ball: no finite radius
 
 
 @item
 @no_type_check
-def power_of_two(row):
-    """The power of two just above the largest entry; 1 for a zero row."""
+def scale_of(A, row):
+    """1 for ordinary rows; for rows so long or short that their squares leave the floating-point numbers, the power of
+    two by which they are multiplied before (exactly)."""
     largest = 0.0
-    for j in range(len(row)):
-        largest = max(largest, abs(row[j]))
-    mantissa, _ = math.frexp(largest)
-    return largest / mantissa if largest > 0 else 1.0
+    for j in range(A.shape[1]):
+        largest = max(largest, abs(A[row, j]))
+    if SHORT < largest < LONG or largest == 0.0 or not largest < np.inf:
+        return 1.0
+    _, exponent = math.frexp(largest)
+    return math.ldexp(1.0, min(1 - exponent, 1023))
 
 
 @item
@@ -109,36 +110,45 @@ def to_frame(A, b, y, L, metric, unit, offsets, sizes, lengths):
         if not math.isfinite(y[j]):
             status = UNDEFINED
     for r in range(m):
-        power = power_of_two(A[r])
-        offset, size, square = b[r] / power, abs(b[r] / power), 0.0
-        finite = math.isfinite(b[r])
+        scale = scale_of(A, r)
+        offset, square, finite = b[r] * scale, 0.0, math.isfinite(b[r])
+        size = abs(offset)
         for j in range(p):
-            finite = finite and math.isfinite(A[r, j])
-            part = A[r, j] / power
+            part = A[r, j] * scale
             unit[r, j] = part
             offset -= part * y[j]
             size += abs(part * y[j])
+            square += part * part
         if metric:
             whiten(L, unit[r])
-        for j in range(p):
-            square += unit[r, j] ** 2
-        length = math.sqrt(square)
-        if not finite:
-            status = UNDEFINED
+            square = dot(unit[r], unit[r])
+        lengths[r, 0], lengths[r, 1] = scale, math.sqrt(square)
+        if not (finite and square < np.inf):
+            status, square = UNDEFINED, 0.0
         elif square == 0.0 and b[r] < 0.0 and status == OK:
             status = EMPTY
-        is_row = finite and square > 0.0
-        lengths[r, 0], lengths[r, 1] = power, length
-        offsets[r] = offset / length if is_row else np.inf
-        sizes[r] = size / length if is_row else 0.0
+        inverse = 1.0 / lengths[r, 1] if square > 0.0 else 0.0
+        offsets[r] = offset * inverse if square > 0.0 else np.inf
+        sizes[r] = size * inverse
         for j in range(p):
-            unit[r, j] = unit[r, j] / length if is_row else 0.0
+            unit[r, j] *= inverse
     return status
 
 
 @item
 @no_type_check
-def solve_rows(N, k, pull, offsets, Q, D, R, work, z, mu):
+def distance(A, b, row, z, lengths):
+    """(a.z - b) / |a| of a row, with the lengths as `to_frame` gives them."""
+    scale = lengths[row, 0]
+    over = -b[row] * scale
+    for j in range(len(z)):
+        over += A[row, j] * scale * z[j]
+    return over / lengths[row, 1]
+
+
+@item
+@no_type_check
+def solve_rows(N, k, pull, offsets, Q, D, T, work, z, mu):
     """z + N' mu = pull, N z = offsets for the first k rows of N: in the span of the rows z follows from the offsets,
     beyond it from the pull. A row that depends on those before it counts for nothing."""
     p = len(z)
@@ -146,11 +156,9 @@ def solve_rows(N, k, pull, offsets, Q, D, R, work, z, mu):
     for s in range(k):
         for j in range(p):
             Q[s, j] = N[s, j]
-        orthogonalise(Q[s], Q, D, s, R[:, s])
-        D[s] = dot(Q[s], Q[s])
-        if D[s] <= ROUND_OFF**2 * dot(N[s], N[s]):
-            D[s] = np.inf
-    on_rows(offsets, Q, D, R, k, y, z)
+        square = orthogonalise(Q[s], Q, D, s, T[s])
+        D[s] = 1.0 / square if square > ROUND_OFF**2 * dot(N[s], N[s]) else 0.0
+    on_rows(offsets, Q, D, T, k, y, z)
     for j in range(p):
         d[j] = pull[j]
     orthogonalise(d, Q, D, k, e)
@@ -158,12 +166,12 @@ def solve_rows(N, k, pull, offsets, Q, D, R, work, z, mu):
         e[s] -= y[s]
     for j in range(p):
         z[j] += d[j]
-    solve_upper(R, e, k, mu)
+    solve_upper(T, e, k, mu)
 
 
 @item
 @no_type_check
-def finish_nearest(A, b, y, L, metric, unit, sizes, lengths, rows, k, Q, D, R, work, N, x, z, mu):
+def finish_nearest(A, b, y, L, metric, unit, sizes, lengths, rows, k, Q, D, T, work, N, x, z, mu):
     """From the active rows and the point x in the frame: the point z, the multipliers mu of the given rows, verified.
 
     Returns:
@@ -176,16 +184,13 @@ def finish_nearest(A, b, y, L, metric, unit, sizes, lengths, rows, k, Q, D, R, w
     for j in range(p):
         z[j] = y[j] + x[j]
     for s in range(k):
-        r = rows[s]
-        right[s] = b[r] / lengths[r, 0]
         for j in range(p):
-            N[s, j] = unit[r, j]
-            right[s] -= A[r, j] / lengths[r, 0] * z[j]
-        right[s] /= lengths[r, 1]
+            N[s, j] = unit[rows[s], j]
+        right[s] = -distance(A, b, rows[s], z, lengths)
     size = from_frame(L, metric, y, z, x)
     for j in range(p):
         pull[j] = -x[j]
-    solve_rows(N, k, pull, right, Q, D, R, work, correction, mu)
+    solve_rows(N, k, pull, right, Q, D, T, work, correction, mu)
     if metric:
         unwhiten(L, correction)
     for j in range(p):
@@ -202,20 +207,13 @@ def finish_nearest(A, b, y, L, metric, unit, sizes, lengths, rows, k, Q, D, R, w
             left += mu[s] * N[s, j]
         verified = verified and abs(left) <= VERIFIED * total
     for r in range(m):
-        if sizes[r] == 0.0 and lengths[r, 1] == 0.0:
-            continue
-        over, around = -b[r] / lengths[r, 0], abs(b[r] / lengths[r, 0])
-        for j in range(p):
-            part = A[r, j] / lengths[r, 0]
-            over += part * z[j]
-            around += abs(part) * abs(z[j])
-        noise = VERIFIED * (around / lengths[r, 1] + sizes[r] + size)
-        verified = verified and over <= noise * lengths[r, 1]
-        for s in range(k):
-            if rows[s] == r:
-                verified = verified and over >= -noise * lengths[r, 1]
+        if lengths[r, 1] > 0.0 and not distance(A, b, r, z, lengths) <= VERIFIED * (size + sizes[r]):
+            verified = False
     for s in range(k):
-        mu[s] = mu[s] / lengths[rows[s], 1] / lengths[rows[s], 0]
+        r = rows[s]
+        verified = verified and distance(A, b, r, z, lengths) >= -VERIFIED * (size + sizes[r])
+    for s in range(k):
+        mu[s] = mu[s] / lengths[rows[s], 1] * lengths[rows[s], 0]
     return OK if verified else UNSOLVED
 
 
@@ -226,14 +224,14 @@ def from_frame(L, metric, y, z, x):
     size = 0.0
     for i in range(len(x)):
         x[i] = z[i] - y[i]
-        size += abs(x[i])
+        size += abs(z[i]) + abs(y[i])
     if metric:
         size = 0.0
         for i in range(len(x)):
             total = 0.0
             for j in range(i, len(x)):
                 total += L[j, i] * x[j]
-                size += abs(L[j, i] * x[j])
+                size += abs(L[j, i]) * (abs(z[j]) + abs(y[j]))
             x[i] = total
     return size
 
@@ -245,7 +243,7 @@ def nearest_point(A, b, y, H, z, mu, rows, filled, status):
     B, m, p = A.shape
     metric = len(H) > 0
     unit, offsets, sizes, lengths = np.empty((m, p)), np.empty(m), np.empty(m), np.empty((m, 2))
-    L, Q, R, N = np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p))
+    L, Q, T, N = np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p))
     D, work, x = np.zeros(p), np.zeros((6, p)), np.zeros(p)
     for i in range(B):
         state = OK
@@ -255,10 +253,10 @@ def nearest_point(A, b, y, H, z, mu, rows, filled, status):
             state = to_frame(A[i], b[i], y[i], L, metric, unit, offsets, sizes, lengths)
         k = 0
         if state == OK:
-            k, state = nearest_rows(unit, offsets, sizes, ROUND_OFF, rows[i], Q, D, R, work, x)
+            k, state = nearest_rows(unit, offsets, sizes, ROUND_OFF, rows[i], Q, D, T, work, x)
         if state == OK:
             state = finish_nearest(
-                A[i], b[i], y[i], L, metric, unit, sizes, lengths, rows[i], k, Q, D, R, work, N, x, z[i], mu[i]
+                A[i], b[i], y[i], L, metric, unit, sizes, lengths, rows[i], k, Q, D, T, work, N, x, z[i], mu[i]
             )
         status[i] = state
         for s in range(p):
@@ -271,7 +269,7 @@ def nearest_point(A, b, y, H, z, mu, rows, filled, status):
 
 @item
 @no_type_check
-def has_multipliers(A, simplex, basis, V, least, N, Q, D, R, work):
+def has_multipliers(A, simplex, basis, V, least, N, Q, D, T, work):
     """Is (0, .., 0, 1) a combination with weights >= 0 of those rows of the basis whose multiplier is above `least`?"""
     m, n = A.shape
     pull, offsets, left, mu, k = work[3], work[4], work[5], V[n - 1], 0
@@ -281,7 +279,7 @@ def has_multipliers(A, simplex, basis, V, least, N, Q, D, R, work):
             for j in range(n):
                 N[k, j] = A[basis[s], j] if basis[s] < m else simplex[basis[s] - m, j]
             k += 1
-    solve_rows(N, k, pull, offsets, Q, D, R, work, left, pull)
+    solve_rows(N, k, pull, offsets, Q, D, T, work, left, pull)
     for j in range(n):
         if not (abs(left[j]) <= VERIFIED and (j >= k or pull[j] >= -VERIFIED)):
             return False
@@ -290,14 +288,14 @@ def has_multipliers(A, simplex, basis, V, least, N, Q, D, R, work):
 
 @item
 @no_type_check
-def finish_ball(A, b, simplex, basis, V, w, far, N, Q, D, R, work):
+def finish_ball(A, b, simplex, basis, V, w, far, N, Q, D, T, work):
     """From the rows that decide the largest ball, in the frame, to its status, verified.
 
     Args:
         A: (m, p + 1), the rows (a_j, 1).
         b: (m,), their bounds.
         simplex, basis, V, w, far: see `inscribed_rows`.
-        N, Q, R: (p + 1, p + 1), scratch.
+        N, Q, T: (p + 1, p + 1), scratch.
         D: (p + 1,), scratch.
         work: (6, p + 1), scratch.
     """
@@ -314,21 +312,22 @@ def finish_ball(A, b, simplex, basis, V, w, far, N, Q, D, R, work):
     open_radius = is_open and far[n - 1] > ROUND_OFF * reach
 
     if not (
-        has_multipliers(A, simplex, basis, V, 0.0, N, Q, D, R, work)
-        or has_multipliers(A, simplex, basis, V, ROUND_OFF * spread, N, Q, D, R, work)
+        has_multipliers(A, simplex, basis, V, 0.0, N, Q, D, T, work)
+        or has_multipliers(A, simplex, basis, V, ROUND_OFF * spread, N, Q, D, T, work)
     ):
         return UNSOLVED
     for j in range(m):
         if b[j] < np.inf:
             rate = dot(A[j], far) if is_open else 0.0
-            over, noise = dot(A[j], w) - b[j], VERIFIED * (size + abs(b[j]))
             if not rate <= VERIFIED * reach:
                 return UNSOLVED
-            if not open_radius and rate >= -VERIFIED * reach and not over <= noise:
-                return UNSOLVED
-            for s in range(n):
-                if basis[s] == j and not over >= -noise:
+            if not open_radius and rate >= -VERIFIED * reach:
+                if not excess(A, b, j, w) <= VERIFIED * (size + abs(b[j])):
                     return UNSOLVED
+    for s in range(n):
+        r = basis[s]
+        if r < m and not excess(A, b, r, w) >= -VERIFIED * (size + abs(b[r])):
+            return UNSOLVED
     if open_radius:
         return BOUNDLESS
     if abs(w[n - 1]) <= ROUND_OFF * (size + largest):
@@ -371,14 +370,9 @@ def inscribed_ball(A, b, simplex, centre, radius, rows, status):
     """Fills the last four."""
     B, m, p = A.shape
     unit, offsets, sizes, lengths = np.ones((m, p + 1)), np.empty(m), np.empty(m), np.empty((m, 2))
-    M, V, work, able = (
-        np.zeros((p + 1, p + 1)),
-        np.zeros((p + 1, p + 1)),
-        np.zeros((4, p + 1)),
-        np.zeros(p + 1, np.bool_),
-    )
+    M, V, work, able = np.zeros((p + 1, p + 1)), np.zeros((p + 1, p + 1)), np.zeros((5, p + 1)), np.zeros(p + 1, np.bool_)
     origin, L = np.zeros(p), np.zeros((p, p))
-    Q, D, R, scratch = np.zeros((p + 1, p + 1)), np.zeros(p + 1), np.zeros((p + 1, p + 1)), np.zeros((6, p + 1))
+    Q, D, T, scratch = np.zeros((p + 1, p + 1)), np.zeros(p + 1), np.zeros((p + 1, p + 1)), np.zeros((6, p + 1))
     w, far = work[2], work[3]
     for i in range(B):
         state = to_frame(A[i], b[i], origin, L, False, unit[:, :p], offsets, sizes, lengths)
@@ -387,31 +381,31 @@ def inscribed_ball(A, b, simplex, centre, radius, rows, status):
         elif state == OK:
             state = UNSOLVED
             if inscribed_rows(unit, offsets, simplex, ROUND_OFF, rows[i], M, V, work, able):
-                state = finish_ball(unit, offsets, simplex, rows[i], V, w, far, M, Q, D, R, scratch)
+                state = finish_ball(unit, offsets, simplex, rows[i], V, w, far, M, Q, D, T, scratch)
         radius[i], status[i] = write_ball(w, m, state, centre[i], rows[i])
 
 
 @item
 @no_type_check
-def solve_given(N, k, pull, offsets, L, metric, rows, Q, D, R, work, z, mu):
+def solve_given(N, k, pull, offsets, L, metric, rows, Q, D, T, work, z, mu):
     """H z + N' mu = pull, N z = offsets, for the first k rows of N, of any length: fills the last two. Scratch before."""
     right, given = work[3], work[4]
     for s in range(k):
-        power = power_of_two(N[s])
+        scale = scale_of(N, s)
         for j in range(len(z)):
-            rows[s, j] = N[s, j] / power
-        right[s] = offsets[s] / power
+            rows[s, j] = N[s, j] * scale
+        right[s] = offsets[s] * scale
         if metric:
             whiten(L, rows[s])
     for j in range(len(z)):
         given[j] = pull[j]
     if metric:
         whiten(L, given)
-    solve_rows(rows, k, given, right, Q, D, R, work, z, mu)
+    solve_rows(rows, k, given, right, Q, D, T, work, z, mu)
     if metric:
         unwhiten(L, z)
     for s in range(k):
-        mu[s] /= power_of_two(N[s])
+        mu[s] *= scale_of(N, s)
 
 
 @launcher
@@ -421,7 +415,7 @@ def solve_active(N, filled, pull, offsets, H, z, mu):
     H: (B, p, p), or (0, p, p) for the identity."""
     B, n, p = N.shape
     metric = len(H) > 0
-    L, Q, R, rows = np.zeros((p, p)), np.zeros((n, p)), np.zeros((n, n)), np.zeros((n, p))
+    L, Q, T, rows = np.zeros((p, p)), np.zeros((n, p)), np.zeros((n, n)), np.zeros((n, p))
     D, work = np.zeros(n), np.zeros((6, max(n, p)))
     for i in range(B):
         k = 0
@@ -431,7 +425,7 @@ def solve_active(N, filled, pull, offsets, H, z, mu):
             for j in range(p):
                 z[i, j] = np.nan
         else:
-            solve_given(N[i], k, pull[i], offsets[i], L, metric, rows, Q, D, R, work, z[i], mu[i])
+            solve_given(N[i], k, pull[i], offsets[i], L, metric, rows, Q, D, T, work, z[i], mu[i])
 
 
 @launcher
@@ -439,7 +433,7 @@ def solve_active(N, filled, pull, offsets, H, z, mu):
 def nearest_point_vjp(A, rows, filled, mu, z, status, grad_z, grad_mu, grad_A, grad_b, grad_y):
     """The vector-Jacobian products of the nearest point in the metric I: fills the last three, which are zero before."""
     B, p = z.shape
-    L, Q, R, N, scaled = np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p))
+    L, Q, T, N, scaled = np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p))
     D, work, u, v = np.zeros(p), np.zeros((6, p)), np.zeros(p), np.zeros(p)
     for i in range(B):
         if status[i] != OK:
@@ -449,7 +443,7 @@ def nearest_point_vjp(A, rows, filled, mu, z, status, grad_z, grad_mu, grad_A, g
             for j in range(p):
                 N[k, j] = A[i, rows[i, k], j]
             k += 1
-        solve_given(N, k, grad_z[i], grad_mu[i], L, False, scaled, Q, D, R, work, u, v)
+        solve_given(N, k, grad_z[i], grad_mu[i], L, False, scaled, Q, D, T, work, u, v)
         for j in range(p):
             grad_y[i, j] = u[j]
         for s in range(k):
@@ -464,7 +458,7 @@ def inscribed_ball_vjp(A, centre, radius, rows, simplex, grad_centre, grad_radiu
     """The vector-Jacobian products of the largest ball: fills the last two, which are zero before."""
     B, m, p = A.shape
     n = p + 1
-    L, Q, R, N, scaled = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
+    L, Q, T, N, scaled = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
     D, work, nothing, v, u = np.zeros(n), np.zeros((6, n)), np.zeros(n), np.zeros(n), np.zeros(n)
     pull = np.zeros(n)
     for i in range(B):
@@ -473,15 +467,15 @@ def inscribed_ball_vjp(A, centre, radius, rows, simplex, grad_centre, grad_radiu
         has_centre = math.isfinite(centre[i, 0])
         for s in range(n):
             real = rows[i, s] < m
-            power, square = power_of_two(A[i, rows[i, s]]) if real else 1.0, 0.0
+            scale, square = scale_of(A[i], rows[i, s]) if real else 1.0, 0.0
             for j in range(p):
                 N[s, j] = A[i, rows[i, s], j] if real else simplex[rows[i, s] - m, j]
-                square += (N[s, j] / power) ** 2
-            N[s, p] = power * math.sqrt(square)
+                square += (N[s, j] * scale) ** 2
+            N[s, p] = math.sqrt(square) / scale
         for j in range(p):
             pull[j] = grad_centre[i, j] if has_centre else 0.0
         pull[p] = grad_radius[i]
-        solve_given(N, n, pull, nothing, L, False, scaled, Q, D, R, work, u, v)
+        solve_given(N, n, pull, nothing, L, False, scaled, Q, D, T, work, u, v)
         for s in range(n):
             if rows[i, s] < m:
                 grad_b[i, rows[i, s]] += v[s]

@@ -34,11 +34,11 @@ from torchfsid.errors import InputError, SolverError
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.identification.active_set import active_set
 from torchfsid.identification.kkt import solve_kkt
+from torchfsid.observers.motions import Array, Motion, ObservedMotion, QpMotion, Wish
 from torchfsid.outcome import FilterStatus
 from torchfsid.robots.barriers import Barrier, controller_failed, stack_barriers
-from torchfsid.robots.controller import solve_safe_qp
 from torchfsid.robots.measurement import Measurement
-from torchfsid.robots.tasks import Saturation, Task
+from torchfsid.robots.tasks import Task
 from torchfsid.tolerances import ACTIVE_TOLERANCE
 
 FLOOR = 1e-8
@@ -55,10 +55,6 @@ FARTHEST = 1e100
 
 SIGMA_POINTS = {"alpha": 1.0, "beta": 2.0, "kappa": 0.0}
 """No weight is negative, so that a prediction stays positive definite; alpha < 0.1 loses digits to cancellation."""
-
-Array = np.ndarray
-Motion = Callable[[Array], Array]
-"""Velocities (S, n) [m/s] as a function of parameters (S, p)."""
 
 
 @dataclass(frozen=True)
@@ -220,11 +216,11 @@ class ParameterUkf:
         clip = self.task.saturation
         if self.qp_inside:
             items = zip(safe_controls.A, safe_controls.b, C, d, strict=True)
-            moving = [_QpMotion(_Wish(C_i, d_i, clip), Halfspaces(A, b)) for A, b, C_i, d_i in items]
+            moving = [QpMotion(Wish(C_i, d_i, clip), Halfspaces(A, b)) for A, b, C_i, d_i in items]
         else:
             kkt = solve_kkt(safe_controls, active_set(safe_controls, u, self.active_tolerance), C, d)
             items = zip(kkt.free, kkt.offset, C, d, strict=True)
-            moving = [_ObservedMotion(_Wish(C_i, d_i, clip), free, offset) for free, offset, C_i, d_i in items]
+            moving = [ObservedMotion(Wish(C_i, d_i, clip), free, offset) for free, offset, C_i, d_i in items]
         return [motion if readable else None for motion, readable in zip(moving, known, strict=True)]
 
     def _update_robot(self, i: int, dt: float, position: Array | None) -> FilterStatus:
@@ -271,7 +267,7 @@ class ParameterUkf:
         return kalman
 
 
-# What filterpy works with. Functions and records of this module, not closures, so that an observer can be pickled.
+# What filterpy works with. Functions of this module, not closures, so that an observer can be pickled.
 
 
 class _Filter(UnscentedKalmanFilter):
@@ -279,42 +275,6 @@ class _Filter(UnscentedKalmanFilter):
 
     def compute_process_sigmas(self, dt: float, fx: Callable[..., Array] | None = None, **fx_args: Any) -> None:
         self.sigmas_f = (fx or self.fx)(self.points_fn.sigma_points(self.x, self.P), dt, **fx_args)
-
-
-@dataclass(frozen=True)
-class _Wish:
-    """uhat = C theta + d, clipped if the task says so."""
-
-    C: Float[Tensor, "n p"]
-    d: Float[Tensor, "n"]
-    clip: Saturation | None
-
-    def __call__(self, theta: Array) -> Float[Tensor, "s n"]:
-        wish = torch.from_numpy(theta) @ self.C.T + self.d
-        return wish if self.clip is None else self.clip(wish)
-
-
-@dataclass(frozen=True)
-class _ObservedMotion:
-    """u = (I - P) uhat + A_a^+ b_a, which is G theta + f where nothing is clipped."""
-
-    wish: _Wish
-    free: Float[Tensor, "n n"]
-    offset: Float[Tensor, "n"]
-
-    def __call__(self, theta: Array) -> Array:
-        return (self.wish(theta) @ self.free.T + self.offset).numpy()
-
-
-@dataclass(frozen=True)
-class _QpMotion:
-    """u = argmin |u - uhat|^2 over the safe controls; zero where there are none."""
-
-    wish: _Wish
-    safe_controls: Halfspaces
-
-    def __call__(self, theta: Array) -> Array:
-        return solve_safe_qp(self.safe_controls, self.wish(theta)).u.numpy()
 
 
 def _move(states: Array, dt: float, motion: Motion, n: int) -> Array:

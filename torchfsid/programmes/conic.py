@@ -114,7 +114,7 @@ def _solve(layer: CvxpyLayer, *tensors: Tensor) -> list[Tensor]:
         found = layer(*flat, solver_args=SOLVE | (DIFFERENTIATE if differentiate else {}))
     except DiffcpError as error:
         raise SolverError(f"SCS gave up: {error}") from error
-    return [v.reshape(*batch, *v.shape[1:]) for v in found]
+    return [v.reshape((*batch, *v.shape[1:])) for v in found]
 
 
 class ActiveRowsSolver(SolverInterface):

@@ -24,7 +24,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchfsid.errors import InputError
-from torchfsid.halfspaces import Halfspaces
+from torchfsid.halfspaces import Halfspaces, lengths
 from torchfsid.outcome import ProgrammeStatus
 from torchfsid.programmes import exact
 from torchfsid.programmes.exact import simplex_around
@@ -239,7 +239,7 @@ class _InscribedBall(torch.autograd.Function):
         real, rows = rows < A.shape[-2], rows.clamp(max=A.shape[-2] - 1)
         N, index = _taken(A, rows)
         N = torch.where(real.unsqueeze(-1), N, torch.as_tensor(simplex_around(A.shape[-1])[:, :-1], device=A.device))
-        norms = torch.linalg.vector_norm(N, dim=-1, keepdim=True)
+        norms = lengths(N).unsqueeze(-1)
         touching = _finite(centre).unsqueeze(-2) + _finite(radius)[..., None, None] * N / norms
         return torch.cat([N, norms], dim=-1), touching, real, rows, index
 

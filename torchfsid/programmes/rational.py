@@ -32,8 +32,8 @@ def nearest_point(A: Array, b: Array, y: Array, H: Array, z: Array, mu: Array, r
     real = np.flatnonzero(offsets < np.inf)
     N, o, noise = fractions(unit[real]), fractions(offsets[real]), fractions(sizes[real])
     if not metric:  # the rows as they were given, up to powers of two
-        N, noise = fractions(A[real] / lengths[real, :1]), fractions(sizes[real] * lengths[real, 1])
-        o = fractions(b[real] / lengths[real, 0]) - N @ fractions(y)
+        N, noise = fractions(A[real] * lengths[real, :1]), fractions(sizes[real] * lengths[real, 1])
+        o = fractions(b[real] * lengths[real, 0]) - N @ fractions(y)
     scratch = [fractions(np.zeros(shape)) for shape in ((p, p), p, (p, p), (6, p))]
     x, active = fractions(np.zeros(p)), np.zeros(p, dtype=np.int64)
     k, status = nearest_rows(N, o, noise, 0, active, *scratch, x)
@@ -59,12 +59,12 @@ def inscribed_ball(A: Array, b: Array, simplex: Array, centre: Array, rows: Arra
     kernel.to_frame(A, b, np.zeros(p), np.zeros((p, p)), False, unit[:, :p], offsets, sizes, lengths)
     real = np.flatnonzero(offsets < np.inf)
     basis, able = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=bool)
-    M, V, work = (fractions(np.zeros(shape)) for shape in ((n, n), (n, n), (4, n)))
+    M, V, work = (fractions(np.zeros(shape)) for shape in ((n, n), (n, n), (5, n)))
     found = inscribed_rows(
         fractions(unit[real]), fractions(offsets[real]), fractions(simplex), 0, basis, M, V, work, able
     )
     rows[:] = np.where(basis < len(real), np.append(real, np.arange(n))[basis], basis - len(real) + m)
-    w, far = work[2:].astype(float)
+    w, far = work[2:4].astype(float)
     status = kernel.UNSOLVED
     if found:
         scratch = [np.zeros(shape) for shape in ((n, n), (n, n), n, (n, n), (6, n))]

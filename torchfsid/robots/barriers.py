@@ -86,18 +86,20 @@ def row_errors(
 
 
 def controller_failed(
-    barriers: Sequence[Barrier], measurement: Measurement, rows: Halfspaces
+    barriers: Sequence[Barrier], measurement: Measurement, rows: Halfspaces, errors: RowErrors | None = None
 ) -> Bool[Tensor, "*batch"]:
     """Has the controller of each robot found no solution? Then it commands exactly zero, which says nothing.
 
-    A robot's own QP has failed if zero violates one of its `rows`. A joint QP stops the whole team, whichever pair is
-    at odds, so it may have failed whenever nobody moves.
+    A robot's own QP has failed if zero violates one of its `rows`; it may have failed if zero violates one that is off
+    by its `errors`. A joint QP stops the whole team, whichever pair is at odds, so it may have failed whenever nobody
+    moves.
     """
     assert measurement.u is not None
     stopped = (measurement.u == 0).all(-1)
     if not bool(stopped.any()):
         return stopped
-    failed = stopped & (rows.b < 0).any(-1)
+    least = torch.zeros_like(rows.b) if errors is None else errors.slack * rows.norms()
+    failed = stopped & (rows.b < least).any(-1)
     perhaps_joint = any(getattr(barrier, "neighbour_velocity", None) in ("current", None) for barrier in barriers)
     if perhaps_joint and measurement.body_velocities is not None:
         others_move = (measurement.present & (measurement.body_velocities != 0).any(-1)).any(-1)

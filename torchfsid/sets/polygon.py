@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -94,7 +93,7 @@ class Polygon:
     def select(self, items: Int[Tensor, "k"]) -> Polygon:
         """The sub-batch at `items`, without the slots that none of it needs."""
         slots = int(self.count[items].max()) if len(items) > 0 else self.slots
-        return Polygon(*(part.index_select(0, items) for part in self._resized(slots)), self.sheets)._pruned()
+        return Polygon(*(part.index_select(0, items) for part in self._resized(slots)), sheets=self.sheets)._pruned()
 
     def replaced(self, items: Int[Tensor, "k"], other: Polygon) -> Polygon:
         """This batch with `other` in the places `items`, and no more slots than that needs."""
@@ -105,7 +104,7 @@ class Polygon:
         slots = max(int(staying.max()), int(other.count.max()))
         mine, theirs = self._resized(slots), replace(other, label=label)._resized(slots)
         parts = (part.index_copy(0, items, new) for part, new in zip(mine, theirs, strict=True))
-        return Polygon(*parts, sheets)._pruned()
+        return Polygon(*parts, sheets=sheets)._pruned()
 
     def _pruned(self) -> Polygon:
         """Without the sheets of rows that are no edges any more."""
@@ -136,7 +135,7 @@ class Polygon:
         """See `Body`. Edges whose neighbours cannot be extended to meet (of a parallelogram) are never merged."""
         differentiable = torch.is_grad_enabled() and (A.requires_grad or b.requires_grad)
         first = 1 + self.sheets.rows if differentiable else 0
-        parts, outcome, shrunk, against = kernel.clip(
+        parts, outcome, shrunk, entered, against = kernel.clip(
             tuple(map(array, self.fields())), array(A), array(b), array(time), array(source), first, most
         )
         device = A.device
@@ -144,13 +143,11 @@ class Polygon:
         outcomes, smaller = torch.from_numpy(outcome).to(device), torch.from_numpy(shrunk).to(device)
         if not shrunk.any():
             return Clipped(self, outcomes, smaller, contradiction)
-        sheets, label = self.sheets, parts[5]
+        sheets = self.sheets
         if differentiable:
-            entered = label >= first
-            rows = torch.from_numpy(label[entered] - first).to(device)
-            label[entered] = first + np.arange(len(rows))
+            rows = torch.from_numpy(entered).to(device)
             sheets = sheets.with_sheet(A.flatten(0, 1).index_select(0, rows), b.flatten().index_select(0, rows))
-        body = Polygon(*(torch.from_numpy(part).to(device) for part in parts), sheets)
+        body = Polygon(*(torch.from_numpy(part).to(device) for part in parts), sheets=sheets)
         return Clipped(body._pruned(), outcomes, smaller, contradiction)
 
     # What is asked of a polygon ------------------------------------------------------------------------------------

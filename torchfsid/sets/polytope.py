@@ -73,10 +73,6 @@ class Polytope:
         """Slots that hold a facet."""
         return torch.arange(self.A.shape[1], device=self.count.device) < self.count.unsqueeze(-1)
 
-    def rows(self) -> tuple[Float[Tensor, "B F p"], Float[Tensor, "B F"]]:
-        """The facets' rows; each carries its gradient."""
-        return self.A, self.b
-
     def select(self, items: Tensor) -> Polytope:
         """The sub-batch at `items` (indices or a mask)."""
         chosen, origins = self._positions(items), self._origins()
@@ -125,6 +121,10 @@ class Polytope:
         cells, kept = zip(*(merged(cell, most) for cell in self._cells), strict=True)
         origins = [origin[some] for origin, some in zip(self._origins(), kept, strict=True)]
         return self._of(list(cells), origins, _Rows.join(self._rows()))
+
+    def rows(self) -> tuple[Float[Tensor, "B F p"], Float[Tensor, "B F"]]:
+        """A and b; each row carries its gradient."""
+        return self.A, self.b
 
     # What is asked of a polytope ------------------------------------------------------------------------------------
 
