@@ -22,6 +22,7 @@ from experiments.studies.switches import across, summarise_switches
 from torchfsid.config.documents import dump
 from torchfsid.identification.evidence import SetKind
 from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.outcome import Status
 from torchfsid.robots.barriers import ClassK, CollisionAvoidance
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.controller import CbfQpController
@@ -168,12 +169,21 @@ def test_a_set_that_has_lost_its_goal_teaches_nothing():
     for tolerance in (1e-6, 0.05):
         probing = Probing.of(load(f"active_tolerance={tolerance}"))
         goals = probing.draw_goals(128, seed=0)
-        *_, last = probing.samples(placement, goals)
-        out = ~last.estimate.feasible_set.contains(goals, 1e-9)
+        observer = SetMembershipObserver(
+            probing.model.task,
+            probing.model.barriers,
+            probing.prior_of(128),
+            probing.model.kind,
+            active_tolerance=tolerance,
+        )
+        for sample in probing.loop(placement, goals):
+            estimate = observer.update(sample.measurement)
+        out = ~estimate.feasible_set.contains(goals, 1e-9)
         left = probing.left(placement, goals)
-        assert torch.equal(left.sound[0], last.sound & ~out)
+        assert torch.equal(left.sound[0], (estimate.status == Status.OK) & ~out)
         assert (left.area[0, out] == probing.prior_area).all()
-        lost.append(int((last.sound & out).sum()))
+        torch.testing.assert_close(left.area[left.sound], estimate.feasible_set.volume()[left.sound[0]])
+        lost.append(int(((estimate.status == Status.OK) & out).sum()))
     assert lost[0] == 0
     assert lost[1] > 0
 

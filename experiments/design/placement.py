@@ -24,6 +24,7 @@ from experiments.studies.gradient_check import check_gradients, nothing_to_follo
 from experiments.studies.switches import across, summarise_switches
 from experiments.tables import print_rows
 from torchfsid.commands.results_folder import write_json
+from torchfsid.observers.set_membership import SetMembershipObserver
 
 SHOWN = ("random", "adam")
 """The methods whose choices are replayed."""
@@ -148,10 +149,14 @@ class _Corridor:
         return {"goal": goal[0].tolist(), "obstacles": self.probing.obstacles.tolist(), "runs": runs}
 
     def _replay(self, placement: Tensor | None, goal: Tensor) -> dict[str, Any]:
-        samples = []
+        samples, model = [], self.probing.model
+        observer = SetMembershipObserver(
+            model.task, model.barriers, self.probing.prior_of(1), model.kind, model.noise, model.active_tolerance
+        )
         with torch.no_grad():
-            for k, sample in enumerate(self.probing.samples(placement, goal)):
-                theta_set, kkt = sample.estimate.feasible_set, sample.estimate.kkt
+            for k, sample in enumerate(self.probing.loop(placement, goal)):
+                estimate = observer.update(sample.measurement)
+                theta_set, kkt = estimate.feasible_set, estimate.kkt
                 share = k / max(self.config.steps - 1, 1)
                 samples.append(
                     {

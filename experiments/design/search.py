@@ -96,7 +96,7 @@ class Search:
 def predicted_path(probing: Probing, goals: Float[Tensor, "S 2"]) -> Float[Tensor, "T 2"]:
     """Where the robot goes without a probe, on average over its possible goals [m]."""
     with torch.no_grad():
-        return torch.stack([sample.measurement.x.mean(0) for sample in probing.samples(None, goals)])
+        return torch.stack([sample.measurement.x.mean(0) for sample in probing.loop(None, goals)])
 
 
 def drawn(draw: Callable[[Search, int], Tensor]) -> Callable[[Search], Evaluated]:
