@@ -153,7 +153,7 @@ def run_alone(make: Callable, rows: list[Rows], truth: np.ndarray) -> dict:
     }
 
 
-def run_batch(batch: int, updates: int, width: float | None, compiled: bool) -> dict:
+def run_batch(batch: int, updates: int, width: float | None) -> dict:
     """CPU time of a batch, per set and update; truths lost."""
     corner = torch.full((batch, 2), 10.0, dtype=torch.float64)
     sets, truth, spent, cut = FeasibleSet.from_box(-corner, corner), torch.from_numpy(truths(batch, 0)), 0.0, 0
@@ -174,7 +174,7 @@ def main(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     warnings.filterwarnings("ignore")
-    run_batch(2, 3, None, True)  # compile
+    run_batch(2, 3, None)  # compile
     names = installed()
     results: dict = {"batch": options.batch, "updates": options.updates, "wrong": WRONG, "workloads": {}}
     for name, width in WIDTHS.items():
@@ -182,9 +182,10 @@ def main(arguments: list[str]) -> None:
             [(A[0], b[0]) for A, b in workload(options.batch, options.updates, width)],
             truths(options.batch, 0)[0],
         )
-        found = {f"torchfsid, batch, {how}": run_batch(options.batch, options.updates, width, how == "compiled")
-                 for how in ("compiled", "torch")}  # fmt: skip
-        found["torchfsid, one set"] = run_alone(Ours, rows, truth)
+        found = {
+            "torchfsid, batch": run_batch(options.batch, options.updates, width),
+            "torchfsid, one set": run_alone(Ours, rows, truth),
+        }
         found |= {peer: run_alone(PEERS[peer], rows, truth) for peer in names}
         results["workloads"][name] = found
         times = {peer: found[peer]["microseconds"] or np.inf for peer in names}

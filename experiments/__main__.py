@@ -8,34 +8,18 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any
 
-from experiments.config import load_experiment
-from experiments.design.config import load_design
-from experiments.sweep_config import load_sweep
-from torchfsid.errors import ConfigError, FsidError
-
-if TYPE_CHECKING:
-    from torchfsid.robots.measurement import Measurement
-
-USAGE_ERROR, INTERRUPTED = 2, 130
-
-TABLE_WIDTH, SWEEP_WIDTH = 100, 130
-"""Columns that the tables need; a narrower terminal wraps them."""
-
-
-class _Parser(argparse.ArgumentParser):
-    """Mistakes are answered by one line."""
-
-    def error(self, message: str) -> NoReturn:
-        self.exit(USAGE_ERROR, f"{self.prog}: {message}\n")
+from torchfsid.commands.command_line import Parser, add_overrides, execute, use_one_thread
+from torchfsid.commands.results_folder import ResultsFolder
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    parser = _Parser(prog="experiments", description="The paper's experiments: results first, figures from them.")
+    parser = Parser(prog="experiments", description="The paper's experiments: results first, figures from them.")
     commands = parser.add_subparsers(dest="command", required=True)
     run = commands.add_parser("run", help="run an experiment and draw its figures")
     sweep = commands.add_parser("sweep", help="finish a sweep: run what is not in its folder yet, and draw its figures")
@@ -43,33 +27,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for command in (run, sweep, design):
         command.add_argument("config", type=Path, metavar="CONFIG", help="YAML, see configs/")
         command.add_argument("--out", type=Path, required=True, metavar="DIR", help="results folder")
-        command.add_argument("--set", action="append", default=[], metavar="A.B=VALUE", help="override a key")
+        add_overrides(command)
     where = sweep.add_mutually_exclusive_group()
     where.add_argument("--jobs", type=_jobs, default=1, metavar="N", help="processes; -1: one per core (default: 1)")
     where.add_argument("--dask", metavar="ADDRESS", help="run on a Dask cluster, tcp://HOST:PORT of its scheduler")
     figures = commands.add_parser("figures", help="draw the figures of a results folder again")
-    figures.add_argument("folder", type=Path, metavar="DIR", help="results folder of a run")
+    figures.add_argument("out", type=Path, metavar="DIR", help="results folder of a run")
     chosen = parser.parse_args(arguments)
-    try:
-        if chosen.command == "run":
-            _run(chosen.config, chosen.out, chosen.set)
-        elif chosen.command == "sweep":
-            _sweep(chosen.config, chosen.out, chosen.set, chosen.jobs, chosen.dask)
-        elif chosen.command == "design":
-            _design(chosen.config, chosen.out, chosen.set)
-        else:
-            _draw(chosen.folder)
-    except FsidError as error:
-        print(f"experiments: {error}", file=sys.stderr)
-        return USAGE_ERROR
-    except OSError as error:
-        print(f"experiments: {error.filename}: {error.strerror}", file=sys.stderr)
-        return USAGE_ERROR
-    except KeyboardInterrupt:
-        again = "; the same command goes on from here" if chosen.command == "sweep" else ""
-        print(f"experiments: interrupted{again}", file=sys.stderr)
-        return INTERRUPTED
-    return 0
+    folder = ResultsFolder(chosen.out, None)
+    left = "what is done so far is in {folder}"
+    if chosen.command == "sweep":
+        left = "the same command goes on from here"
+    action = _draw_again if chosen.command == "figures" else _run
+    return execute("experiments", lambda: action(chosen, folder), folder, left)
 
 
 def _jobs(text: str) -> int:
@@ -78,97 +48,50 @@ def _jobs(text: str) -> int:
     return int(text)
 
 
-def _require_folder(out: Path) -> None:
-    if out.exists() and not out.is_dir():
-        raise ConfigError(f"--out: {out} is not a folder")
+def _run(chosen: argparse.Namespace, folder: ResultsFolder) -> None:
+    from experiments.kinds import KINDS, Later, load
+
+    config = load(chosen.config, chosen.set, chosen.command)
+    kind, folder.kind = KINDS[config.kind], config.kind
+    folder.require_ours()
+
+    from experiments.results import names
+    from torchfsid.commands.results_folder import write_json
+    from torchfsid.commands.terminal import console, track
+    from torchfsid.config.documents import dump
+
+    use_one_thread()
+    with ExitStack() as stack:
+        options: dict[str, Any] = {}
+        if chosen.command == "sweep":
+            options["team"] = stack.enter_context(Later("sweeps.workers", "workers")(chosen.jobs, chosen.dask))
+        folder.claim(names(config.kind), dump(config), resume=chosen.command == "sweep")
+        summary = kind.run(config, folder.path, track, **options)
+    write_json(folder.path / "summary.json", summary)
+    kind.show(summary, console())
+    _draw(folder, config)
 
 
-def _run(path: Path, out: Path, overrides: Sequence[str]) -> None:
-    config = load_experiment(path, overrides)
-    _require_folder(out)
+def _draw_again(chosen: argparse.Namespace, folder: ResultsFolder) -> None:
+    from experiments.kinds import load
+    from experiments.results import FIGURES
+    from torchfsid.errors import FigureError
 
-    import torch
-    from rich.console import Console
-    from rich.progress import track
-
-    from experiments.run import run
-    from experiments.swarm import print_swarm
-    from experiments.table import print_table
-    from experiments.verdict import print_verdict
-
-    torch.set_num_threads(1)  # small tensors: more threads only wait for each other
-    progress = Console(stderr=True)
-
-    def observing(measurements: Iterable[Measurement], samples: int) -> Iterable[Measurement]:
-        return track(measurements, "Observing", total=samples, console=progress)
-
-    summary = run(config, out, observing)
-    _draw(out)
-    console = Console(width=max(Console().width, TABLE_WIDTH))
-    {"scene": print_verdict, "cases": print_table, "swarm": print_swarm}[config.kind](summary, console)
-
-
-def _sweep(path: Path, out: Path, overrides: Sequence[str], jobs: int, dask: str | None) -> None:
-    config = load_sweep(path, overrides)
-    _require_folder(out)
-
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    from torchfsid.commands.results import write_json
-
+    config = load(folder.path / "config.yaml")
+    folder.claim(FIGURES, resume=True)
     try:
-        from experiments.sweep import sweep
-        from experiments.sweep_summary import print_sweep, summarise_sweep
-    except ModuleNotFoundError as error:
-        raise ConfigError(f"{error}: install torchfsid[experiments]") from error
-
-    def tracked(records: Iterable[Any], total: int, finished: int) -> Iterable[Any]:
-        columns = TextColumn("Sweeping"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()
-        with Progress(*columns, console=Console(stderr=True), speed_estimate_period=600) as progress:
-            task = progress.add_task("", total=total, completed=finished)
-            for record in records:
-                yield record
-                progress.advance(task)
-
-    sweep(config, out, jobs=jobs, dask=dask, track=tracked)
-    summary = summarise_sweep(out)
-    write_json(out / "summary.json", summary)
-    _draw(out)
-    print_sweep(summary, Console(width=max(Console().width, SWEEP_WIDTH)))
+        _draw(folder, config)
+    except FigureError:
+        folder.release()  # nothing was written
+        raise
 
 
-def _design(path: Path, out: Path, overrides: Sequence[str]) -> None:
-    config = load_design(path, overrides)
-    _require_folder(out)
-
-    import torch
-    from rich.console import Console
-    from rich.progress import track
-
-    from experiments.design.run import print_design, run_design
-
-    torch.set_num_threads(1)  # small tensors: more threads only wait for each other
-    progress = Console(stderr=True)
-    summary = run_design(config, out, lambda items, what, total: track(items, what, total, console=progress))
-    _draw(out)
-    print_design(summary, Console(width=max(Console().width, TABLE_WIDTH)))
-
-
-def _draw(folder: Path) -> None:
-    from rich.console import Console
-
+def _draw(folder: ResultsFolder, config: Any) -> None:
     from experiments.figures import draw
+    from torchfsid.commands.terminal import status
 
-    with Console(stderr=True).status("Drawing"):
-        draw(folder)
+    with status("Drawing"):
+        draw(folder.path, config)
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import jaxtyping
 import pytest
 import torch
+from matplotlib.figure import Figure
 
 # On tensors this small torch is many times slower with more threads. They are no part of what is tested.
 torch.set_num_threads(1)
@@ -16,3 +17,9 @@ def unchecked() -> Iterator[None]:
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures are laid out and drawn in seconds, which is tested elsewhere: here they are files of one byte."""
+    monkeypatch.setattr(Figure, "savefig", lambda figure, file, **options: file.write(b"."))

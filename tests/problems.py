@@ -5,6 +5,8 @@ A `Scene` is one robot at one instant: the rows A u <= b of its QP, its task uha
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -203,6 +205,23 @@ def exact_centroid(ring: list[Point]) -> Point:
     return sum((x + p) * w for x, _, p, _, w in pieces) / six_areas, sum(
         (y + q) * w for _, y, _, q, w in pieces
     ) / six_areas
+
+
+def exact_inscribed_radius(A: np.ndarray, b: np.ndarray) -> float:
+    """Of a bounded set in the plane, by duality: the least lambda.b over triples and opposite pairs of rows with
+    lambda >= 0, sum lambda (a, |a|) = (0, 1). Only the lengths |a| are rounded."""
+    rows = [(*exact(row), Fraction(math.hypot(*row)), Fraction(float(bound))) for row, bound in zip(A, b, strict=True)]
+    bounds = []
+    for (p, q, u, b1), (r, s, v, b2), (x, y, w, b3) in itertools.combinations(rows, 3):
+        weights = (r * y - s * x, x * q - y * p, p * s - q * r)  # orthogonal to both columns of the three a
+        total = weights[0] * u + weights[1] * v + weights[2] * w
+        if total != 0 and all(weight / total >= 0 for weight in weights):
+            bounds.append((weights[0] * b1 + weights[1] * b2 + weights[2] * b3) / total)
+    for (p, q, u, b1), (r, s, v, b2) in itertools.combinations(rows, 2):
+        if p * s == q * r and p * r + q * s < 0:
+            share = -(p * r + q * s) / (r * r + s * s)
+            bounds.append((b1 + share * b2) / (u + share * v))
+    return float(min(bounds))
 
 
 def exactly_feasible(A: np.ndarray, b: np.ndarray) -> bool:

@@ -304,8 +304,7 @@ def bags(tmp_path_factory: pytest.TempPathFactory, csv_log) -> dict[str, bytes]:
         write_bag(folder / storage.name, odometry_of(csv_log), storage)
         (file,) = (path for path in (folder / storage.name).iterdir() if path.suffix != ".yaml")
         content[file.suffix] = file.read_bytes()
-    metadata = (folder / "SQLITE3" / "metadata.yaml").read_bytes()
-    return content | {".yaml": metadata}
+    return content | {".yaml": (folder / "SQLITE3" / "metadata.yaml").read_bytes()}
 
 
 @settings(deadline=None, derandomize=True, max_examples=150)

@@ -18,9 +18,10 @@ from torchfsid import (
     SetMembershipObserver,
     simulate,
 )
-from torchfsid.config.observe import AvoidanceConfig, ClassKConfig
+from torchfsid.config.barriers import AvoidanceConfig, ClassKConfig
 from torchfsid.errors import ConfigError, InputError
-from torchfsid.robots.barriers import AffineBarrier, Arena, ClassK, SpeedPolygon
+from torchfsid.robots.affine_barrier import AffineBarrier
+from torchfsid.robots.barriers import Arena, ClassK, SpeedPolygon
 from torchfsid.robots.measurement import Measurement
 
 AT_REST = Measurement.of_team(0.0, torch.zeros(1, 2), torch.zeros(1, 2))

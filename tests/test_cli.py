@@ -69,6 +69,7 @@ def test_observe_writes_the_files_of_the_contract(
     assert {"config.yaml", "regions.png", "regions.pdf"} <= {path.name for path in tmp_path.iterdir()}
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_run_can_be_repeated_from_its_results_folder(files: tuple[Path, Path], tmp_path: Path) -> None:
     log, config = files
     first, second = tmp_path / "first", tmp_path / "second"
@@ -79,6 +80,7 @@ def test_a_run_can_be_repeated_from_its_results_folder(files: tuple[Path, Path],
     assert (first / "regions.json").read_bytes() == (second / "regions.json").read_bytes()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_differentiated_velocities_of_held_commands_are_exact(files: tuple[Path, Path], tmp_path: Path) -> None:
     log, config = files
     options = ["--set", "velocity=differentiated", "--set", "noise.velocity=1e-9"]

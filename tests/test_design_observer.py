@@ -14,9 +14,10 @@ from torch import Tensor
 
 from experiments.__main__ import main
 from experiments.design.adaptive import AdaptiveObserver, ConstantGain, NetworkGain, RlsGain, Step
-from experiments.design.config import LearnedObserverConfig, load_design
+from experiments.design.config import LearnedObserverConfig
 from experiments.design.learning import learn
-from experiments.design.recordings import Recording, record
+from experiments.design.rollouts import Rollouts, roll_out
+from experiments.kinds import load as load_config
 from torchfsid.halfspaces import Halfspaces
 
 CONFIG = Path(__file__).parents[1] / "configs" / "learned_observer.yaml"
@@ -35,21 +36,21 @@ pytestmark = pytest.mark.usefixtures("unchecked")
 
 
 def load(*overrides: str) -> LearnedObserverConfig:
-    config = load_design(CONFIG, overrides)
+    config = load_config(CONFIG, overrides)
     assert isinstance(config, LearnedObserverConfig)
     return config
 
 
 @pytest.fixture(scope="module")
-def recording() -> Recording:
-    return record(load("duration=0.5", "times=[0.1]"), 0.02, 2, np.random.SeedSequence(3), filters=False)
+def recording() -> Rollouts:
+    return roll_out(load("duration=0.5", "times=[0.1]"), 0.02, 2, np.random.SeedSequence(3), filters=False)
 
 
-def inside(theta: Tensor, recording: Recording) -> Tensor:
+def inside(theta: Tensor, recording: Rollouts) -> Tensor:
     return torch.stack([step.theta_set.contains(at, 1e-9) for step, at in zip(recording.steps, theta, strict=True)])
 
 
-def inputs(recording: Recording) -> tuple[Any, ...]:
+def inputs(recording: Rollouts) -> tuple[Any, ...]:
     return recording.steps, recording.theta, recording.information
 
 
@@ -79,7 +80,7 @@ def test_a_whole_constant_gain_inverts_a_free_motion():
     torch.testing.assert_close(estimate[0], goal)
 
 
-def test_estimates_stay_in_the_set_and_truth_too(recording: Recording):
+def test_estimates_stay_in_the_set_and_truth_too(recording: Rollouts):
     network = NetworkGain(4, 36.0, 0.02, pulls=True)
     for gain in (ConstantGain(0.5, 1.0), RlsGain(), RlsGain(0.2), network):
         assert inside(AdaptiveObserver(gain)(*inputs(recording)), recording).all()
@@ -87,13 +88,13 @@ def test_estimates_stay_in_the_set_and_truth_too(recording: Recording):
     assert recording.contains == 1.0
 
 
-def test_an_untrained_network_is_nearly_least_squares(recording: Recording):
+def test_an_untrained_network_is_nearly_least_squares(recording: Rollouts):
     network = AdaptiveObserver(NetworkGain(4, 36.0, 0.02, pulls=False))(*inputs(recording))
     rls = AdaptiveObserver(RlsGain())(*inputs(recording))
     assert (network - rls).norm(dim=-1).max() < 1e-2
 
 
-def test_gradients_through_the_projection(recording: Recording):
+def test_gradients_through_the_projection(recording: Rollouts):
     """Of the mean error over the whole recording with respect to every parameter, against central differences."""
     torch.manual_seed(0)
     network = NetworkGain(2, 36.0, 0.02, pulls=True)
@@ -124,14 +125,16 @@ def test_gradients_through_the_projection(recording: Recording):
 def test_a_run_can_be_repeated_and_is_drawn(tmp_path: Path):
     first, second = tmp_path / "first", tmp_path / "second"
     assert main(["design", str(CONFIG), "--out", str(first), *[word for o in SMALL for word in ("--set", o)]]) == 0
-    config = load_design(first / "config.yaml")
+    config = load_config(first / "config.yaml")
     assert isinstance(config, LearnedObserverConfig)
 
     def silent(items: Iterable[Any], *_: Any) -> Iterable[Any]:
         return items
 
-    learn(config, second, silent)
-    for name in ("runs.csv", "curves.csv", "training.csv", "answers.csv", "gains.json", "summary.json"):
+    second.mkdir()
+    summary = learn(config, second, silent)
+    assert summary == json.loads((first / "summary.json").read_text())
+    for name in ("runs.csv", "curves.csv", "training.csv", "answers.csv", "gains.json"):
         assert (first / name).read_bytes() == (second / name).read_bytes()
     assert (first / "figure.png").stat().st_size > 1000
     table = json.loads((first / "summary.json").read_text())["mean errors by noise [m]"]["0.02"]

@@ -13,15 +13,16 @@ import torch
 from torch import Tensor
 
 from experiments.__main__ import main
-from experiments.design.config import ProbePlacementConfig, load_design
+from experiments.design.config import ProbePlacementConfig
 from experiments.design.placement import place
 from experiments.design.probe import Objective, Probing, along, expectation
-from experiments.design.rollout import closed_loop
-from experiments.design.switches import across, summarise_switches
-from experiments.design.tables import read_rows
+from experiments.kinds import load as load_config
+from experiments.results import read_columns
+from experiments.studies.switches import across, summarise_switches
 from torchfsid.config.documents import dump
 from torchfsid.identification.evidence import SetKind
 from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.outcome import Status
 from torchfsid.robots.barriers import ClassK, CollisionAvoidance
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.controller import CbfQpController
@@ -43,7 +44,7 @@ pytestmark = pytest.mark.usefixtures("unchecked")
 
 
 def load(*overrides: str) -> ProbePlacementConfig:
-    config = load_design(CONFIG, overrides)
+    config = load_config(CONFIG, overrides)
     assert isinstance(config, ProbePlacementConfig)
     return config
 
@@ -63,7 +64,7 @@ def test_whole_pipeline_against_finite_differences(kind: str):
     placement = tensor([[[0.62, 0.05], [0.9, -0.1], [0.8, 0.2]]])
 
     def log_area(at: Tensor) -> Tensor:
-        return probing.outcome(at, goals, steps=12).area[0].log()
+        return probing.left(at, goals, steps=12).area[0].log()
 
     jacobian = torch.autograd.functional.jacobian(log_area, placement).flatten(1)
     step = 1e-6
@@ -120,7 +121,7 @@ def test_gradient_of_the_mean_in_the_corridor(horizon: int):
     goals, placement, step = probing.draw_goals(2048, seed=1), tensor([[[0.65, 0.06]]]), 0.01
 
     def mean(at: Tensor) -> Tensor:
-        return expectation(probing.outcome(at, goals, horizon).area, "area").sum()
+        return expectation(probing.left(at, goals, horizon).area, "area").sum()
 
     gradient = torch.autograd.functional.jacobian(mean, placement).flatten()
     steps = step * torch.eye(2, dtype=torch.float64).reshape(2, 1, 1, 2)
@@ -153,11 +154,11 @@ def test_a_probe_that_comes_too_close_teaches_nothing():
     probing = Probing.of(load())
     goals = probing.draw_goals(4, seed=0)
     over_the_robot = tensor([[[0.6, 0.0], [0.1, 0.0], [-0.4, 0.0]]]).requires_grad_()
-    outcome = probing.outcome(over_the_robot, goals)
-    assert not outcome.sound.any()
-    assert (outcome.area == probing.prior_area).all()
-    assert not outcome.area.requires_grad or torch.autograd.grad(outcome.area.sum(), over_the_robot)[0].norm() == 0
-    beside = probing.outcome(tensor([[[0.6, 0.0]]]), goals)
+    left = probing.left(over_the_robot, goals)
+    assert not left.sound.any()
+    assert (left.area == probing.prior_area).all()
+    assert not left.area.requires_grad or torch.autograd.grad(left.area.sum(), over_the_robot)[0].norm() == 0
+    beside = probing.left(tensor([[[0.6, 0.0]]]), goals)
     assert beside.sound.all()
     assert (beside.area < probing.prior_area).all()
 
@@ -168,12 +169,21 @@ def test_a_set_that_has_lost_its_goal_teaches_nothing():
     for tolerance in (1e-6, 0.05):
         probing = Probing.of(load(f"active_tolerance={tolerance}"))
         goals = probing.draw_goals(128, seed=0)
-        *_, last = probing.samples(placement, goals)
-        out = ~last.estimate.feasible_set.contains(goals, 1e-9)
-        outcome = probing.outcome(placement, goals)
-        assert torch.equal(outcome.sound[0], last.sound & ~out)
-        assert (outcome.area[0, out] == probing.prior_area).all()
-        lost.append(int((last.sound & out).sum()))
+        observer = SetMembershipObserver(
+            probing.model.task,
+            probing.model.barriers,
+            probing.prior_of(128),
+            probing.model.kind,
+            active_tolerance=tolerance,
+        )
+        for sample in probing.loop(placement, goals):
+            estimate = observer.update(sample.measurement)
+        out = ~estimate.feasible_set.contains(goals, 1e-9)
+        left = probing.left(placement, goals)
+        assert torch.equal(left.sound[0], (estimate.status == Status.OK) & ~out)
+        assert (left.area[0, out] == probing.prior_area).all()
+        torch.testing.assert_close(left.area[left.sound], estimate.feasible_set.volume()[left.sound[0]])
+        lost.append(int(((estimate.status == Status.OK) & out).sum()))
     assert lost[0] == 0
     assert lost[1] > 0
 
@@ -193,7 +203,7 @@ def test_allowed_placements_keep_the_safety_distance_and_the_room():
 
 def test_without_a_probe_the_corridor_hides_the_goal():
     probing = Probing.of(load())
-    assert probing.outcome(None, probing.draw_goals(8, seed=0)).area.tolist() == [[1.0] * 8]
+    assert probing.left(None, probing.draw_goals(8, seed=0)).area.tolist() == [[1.0] * 8]
 
 
 def test_a_probe_along_its_way_points():
@@ -201,22 +211,6 @@ def test_a_probe_along_its_way_points():
     at = torch.stack([along(way, share)[0] for share in (0.0, 0.25, 0.5, 0.75, 1.0)])
     assert torch.allclose(at, tensor([[0, 0], [0.5, 0], [1, 0], [1, 1], [1, 2]]))
     assert torch.equal(along(way[:, :1], 0.7), way[:, 0])
-
-
-def test_batched_loops_are_those_of_simulate():
-    """Three scenes at a time, each against `simulate`, whose controls come from another solver."""
-    task, barriers = GoalTask(1.0), [CollisionAvoidance(ClassK(1.0), 0.4)]
-    goals, start = tensor([[3.0, 0.1], [2.6, -0.4], [3.4, 0.4]]), tensor([[0.0, 0.0]]).expand(3, 2)
-    bodies = tensor([[[0.6, 0.7], [0.6, -0.7]], [[0.7, 0.1], [1.0, 0.8]], [[0.5, -0.4], [2.0, 0.0]]])
-    loop = closed_loop(
-        task, barriers, goals, start, lambda *_: bodies, torch.ones(3, 2, dtype=torch.bool), dt=0.05, steps=30
-    )
-    seen = [sample.measurement for sample in loop]
-    for i in range(3):
-        run = simulate(
-            CbfQpController(task, barriers), goals[i : i + 1], start[:1], dt=0.05, steps=29, obstacles=bodies[i]
-        )
-        torch.testing.assert_close(torch.stack([m.x[i] for m in seen]), run.x[:, 0], rtol=0, atol=1e-9)
 
 
 # A run --------------------------------------------------------------------------------------------------------------
@@ -229,13 +223,14 @@ def silent(items: Iterable[Any], *_: Any) -> Iterable[Any]:
 def test_a_run_can_be_repeated_from_its_folder_and_is_drawn(tmp_path: Path):
     first, second = tmp_path / "first", tmp_path / "second"
     assert main(["design", str(CONFIG), "--out", str(first), *[word for o in SMALL for word in ("--set", o)]]) == 0
-    config = load_design(first / "config.yaml")
+    config = load_config(first / "config.yaml")
     assert dump(config) == (first / "config.yaml").read_text()
     assert isinstance(config, ProbePlacementConfig)
+    second.mkdir()
     place(config, second, silent)
-    rows = [[{**row, "seconds": ""} for row in read_rows(folder / "runs.csv")] for folder in (first, second)]
-    assert rows[0] == rows[1]
-    assert len(rows[0]) == 7 + 6
+    ours, theirs = (read_columns(folder / "runs.csv") for folder in (first, second))
+    assert all((ours[name] == theirs[name]).all() for name in ours if name != "seconds")
+    assert len(ours["method"]) == 7 + 6
     for name in (
         "placements.json",
         "replay.json",

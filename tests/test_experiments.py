@@ -14,12 +14,13 @@ import pytest
 import torch
 
 from experiments.__main__ import main
-from experiments.config import CasesConfig, ExpectedConfig, SceneConfig, load_experiment
 from experiments.figures.style import length
-from experiments.recording import simulate_scene
-from experiments.run import run
-from experiments.saved import SETS, Results
-from experiments.summary import compare, stays_below, timeline
+from experiments.kinds import KINDS, load
+from experiments.runs.config import CasesConfig, ExpectedConfig, SceneConfig
+from experiments.runs.recording import simulate_scene
+from experiments.runs.saved import SETS, Results
+from experiments.runs.summary import compare, stays_below, timeline
+from torchfsid.commands.results_folder import write_json
 from torchfsid.config.documents import dump
 from torchfsid.logs.log import read_csv
 
@@ -37,14 +38,21 @@ def _shapes_are_checked_elsewhere() -> Iterator[None]:
     jaxtyping.config.update("jaxtyping_disable", False)
 
 
+def finish(path: Path, out: Path, *overrides: str) -> Results:
+    """What the command line does, figures apart."""
+    config = load(path, overrides, "run")
+    assert isinstance(config, SceneConfig | CasesConfig)
+    (out / "config.yaml").write_text(dump(config), encoding="utf-8")
+    write_json(out / "summary.json", KINDS[config.kind].run(config, out, lambda items, *_: items))
+    return Results(out, config)
+
+
 @pytest.fixture(scope="module")
 def run_experiment(tmp_path_factory: pytest.TempPathFactory) -> Runner:
     """Run a file of configs/ without figures."""
 
     def runner(name: str, *overrides: str) -> Results:
-        out = tmp_path_factory.mktemp(name)
-        run(load_experiment(CONFIGS / f"{name}.yaml", overrides), out, lambda measurements, _: measurements)
-        return Results(out)
+        return finish(CONFIGS / f"{name}.yaml", tmp_path_factory.mktemp(name), *overrides)
 
     return runner
 
@@ -74,9 +82,10 @@ def five_cases(run_experiment: Runner) -> Results:
 
 @pytest.mark.parametrize("name", ["two_pairs", "mixed_active", "four_robots", "five_cases"])
 def test_configs_load_and_survive_being_written(name: str, tmp_path: Path):
-    config = load_experiment(CONFIGS / f"{name}.yaml")
+    config = load(CONFIGS / f"{name}.yaml")
     (tmp_path / "config.yaml").write_text(dump(config), encoding="utf-8")
-    assert load_experiment(tmp_path / "config.yaml") == config
+    assert load(tmp_path / "config.yaml") == config
+    assert isinstance(config, SceneConfig | CasesConfig)
     assert config.set == "critical_region"
 
 
@@ -196,7 +205,7 @@ def test_four_robots_are_all_held_at_first(four_robots: Results):
 def test_a_run_from_its_resolved_config_is_the_same_run(run_experiment: Runner, tmp_path: Path):
     noisy = ("measurement_noise={velocity: 1.0e-3, position: 1.0e-4}", "noise.velocity=2.0e-3", "seed=7")
     first = run_experiment("two_pairs", *SHORT, *noisy)
-    run(load_experiment(first.folder / "config.yaml"), tmp_path, lambda measurements, _: measurements)
+    finish(first.folder / "config.yaml", tmp_path)
     for name in ("estimates.csv", "regions.json", "regions.jsonl", "trajectory.csv", "summary.json", "config.yaml"):
         assert (tmp_path / name).read_bytes() == (first.folder / name).read_bytes(), name
     other = run_experiment("two_pairs", *SHORT, *noisy[:2], "seed=8")
@@ -205,7 +214,7 @@ def test_a_run_from_its_resolved_config_is_the_same_run(run_experiment: Runner, 
 
 def test_measurement_noise_keeps_its_bounds_and_spares_obstacles():
     noise = "measurement_noise={velocity: 0.01, position: 0.02}"
-    config = load_experiment(CONFIGS / "two_pairs.yaml", [*SHORT, noise])
+    config = load(CONFIGS / "two_pairs.yaml", [*SHORT, noise])
     assert isinstance(config, SceneConfig)
     scene = simulate_scene(config)
     for true, measured, bound in ((scene.true.x, scene.measured.x, 0.02), (scene.true.u, scene.measured.u, 0.01)):
@@ -303,6 +312,7 @@ def test_timeline_and_stays_below():
     assert stays_below(t, np.array([3.0, 0.5, 2.0, 0.5]), 1.0) == 0.3
     assert stays_below(t, np.array([0.5, 0.5, 0.5, 0.5]), 1.0) == 0.0
     assert stays_below(t, np.array([0.5, 0.5, 0.5, 2.0]), 1.0) is None
+    assert stays_below(t, np.array([0.5, 0.5, np.nan, np.nan]), 1.0) is None
 
 
 @pytest.mark.parametrize(("switch", "deviation"), [(3, 0.2), (5, 0.0), (6, 0.1)])

@@ -115,8 +115,11 @@ def test_touching_is_undecided_and_stays_in() -> None:
     """x <= -2 meets the box [-2, 2]^2 in an edge: neither surely empty nor of any size."""
     theta = box(2, batch=1).intersect(Halfspaces(torch.tensor([[1.0, 0.0]]), torch.tensor([-2.0])))
     assert theta.emptiness().outcome.item() == Outcome.UNDECIDED
-    assert theta.volume().item() == 16.0
     assert theta.emptiness().witness.isnan().all()
+    assert 0 <= theta.volume().item() < 1e-12
+    edge = torch.tensor([[[-2.0, y]] for y in (-2.0, 0.3, 2.0)], dtype=torch.float64)
+    assert theta.contains(edge).all()
+    assert not theta.contains(torch.tensor([[-1.9, 0.3]], dtype=torch.float64)).any()
 
 
 def test_batch_shapes_and_questions_agree_with_single_sets() -> None:
@@ -144,6 +147,7 @@ def test_batch_shapes_and_questions_agree_with_single_sets() -> None:
         ([0.0, 1.0], [1.0, 1.0], "lower < upper"),
         ([0.0], [1.0, 1.0], r"\(\*batch, p\)"),
         ([0.0, float("nan")], [1.0, 1.0], "lower < upper"),
+        ([-math.inf, 0.0], [1.0, 1.0], "bounded"),
     ],
 )
 @pytest.mark.usefixtures("unchecked")
@@ -163,12 +167,88 @@ def test_wrong_halfspaces_are_refused() -> None:
         theta.project(torch.zeros(3, 2), torch.ones(3, 3))
 
 
+def with_an_empty_item(p: int, **rows: bool) -> tuple[FeasibleSet, torch.Tensor]:
+    """Item 0 is empty, by 3: z_1 <= -5 in [-2, 2]^p; item 1 is [-2, 1] x [-2, 2]^(p - 1). The bounds have gradients."""
+    b = torch.tensor([[-5.0], [1.0]], dtype=torch.float64, requires_grad=rows.get("gradients", False))
+    axis = torch.eye(p, dtype=torch.float64)[:1].expand(2, 1, p)
+    return box(p, batch=2).intersect(Halfspaces(axis, b)), b
+
+
+@pytest.mark.parametrize("p", [1, 2, 3])
+def test_an_empty_item_says_so_in_every_answer(p: int) -> None:
+    sets, _ = with_an_empty_item(p)
+    one = torch.ones(2, p, dtype=torch.float64)
+    centre, radius = sets.chebyshev()
+    assert radius.tolist() == pytest.approx([-1.5, 1.5])
+    assert sets.volume().tolist() == pytest.approx([0.0, 3 * 4.0 ** (p - 1)])
+    assert sets.contains(-one).tolist() == [False, True]
+    for answer in (centre, sets.centroid(), sets.vertices(), sets.diameter(), sets.support(one), sets.project(5 * one)):
+        assert answer[0].isnan().all()
+        assert answer[1].isfinite().all()
+
+
+@pytest.mark.parametrize("p", [1, 2, 3])
+def test_an_empty_item_has_zero_gradients(p: int) -> None:
+    sets, b = with_an_empty_item(p, gradients=True)
+    one = torch.ones(2, p, dtype=torch.float64)
+    asked = (
+        sets.volume(), *sets.chebyshev(), sets.centroid(), sets.vertices(), sets.diameter(), sets.support(one),
+        sets.project(5 * one),
+    )  # fmt: skip
+    for answer in asked:
+        (slope,) = torch.autograd.grad(answer.nansum(), b, retain_graph=True, materialize_grads=True)
+        assert slope[0].item() == 0
+        assert slope.isfinite().all()
+
+
+@pytest.mark.parametrize("p", [1, 2, 3])
+@pytest.mark.parametrize("bad", ["indefinite", "negative", "NaN", "point"])
+def test_projection_with_a_bad_metric_or_point_is_nan_for_that_item(p: int, bad: str) -> None:
+    metric = torch.eye(p, dtype=torch.float64).repeat(2, 1, 1)
+    point = torch.full((2, p), 3.0, dtype=torch.float64)
+    if bad == "indefinite":
+        metric[0, 0, 0] = 0.0
+        metric[0, 0, -1] = metric[0, -1, 0] = 2.0 if p > 1 else 0.0
+    elif bad == "negative":
+        metric[0] *= -1
+    elif bad == "NaN":
+        metric[0, 0, 0] = math.nan
+    else:
+        point[0, 0] = math.inf
+    metric.requires_grad_()
+    nearest = box(p, batch=2).project(point, metric)
+    assert nearest[0].isnan().all()
+    assert nearest[1].tolist() == pytest.approx([2.0] * p)
+    (slope,) = torch.autograd.grad(nearest.nansum(), metric)
+    assert slope.isfinite().all()
+
+
+@pytest.mark.parametrize("p", [1, 2, 3])
+def test_no_rows_change_nothing(p: int) -> None:
+    sets = box(p)
+    assert sets.intersect(Halfspaces(torch.zeros(0, p), torch.zeros(0))) is sets
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("p", [1, 2, 3])
+def test_wrong_shapes_are_refused(p: int) -> None:
+    sets = box(p)
+    for wrong in (torch.ones(3, p + 1), torch.ones(2, p), torch.tensor(1.0)):
+        with pytest.raises(InputError, match="theta"):
+            sets.contains(wrong)
+        with pytest.raises(InputError, match="direction"):
+            sets.support(wrong)
+        with pytest.raises(InputError, match="point"):
+            sets.project(wrong)
+    assert sets.contains(torch.zeros(7, 3, p)).shape == (7, 3)
+
+
 @pytest.mark.parametrize("p", [1, 2, 3])
 def test_a_batch_of_none(p: int) -> None:
     none = FeasibleSet.from_box(-torch.ones(0, p), torch.ones(0, p))
     chosen = FeasibleSet.from_box(-torch.ones(2, p), torch.ones(2, p)).select(torch.zeros(0, dtype=torch.long))
     for sets in (none, chosen):
-        after = sets.intersect(Halfspaces(torch.ones(0, 1, p), torch.ones(0, 1)), compiled=False)
+        after = sets.intersect(Halfspaces(torch.ones(0, 1, p), torch.ones(0, 1)))
         assert after.facets().halfspaces.b.shape[0] == 0
         assert after.contains(torch.zeros(0, p)).shape == after.diameter().shape == after.volume().shape == (0,)
         assert after.centroid().shape == after.chebyshev()[0].shape == (0, p)

@@ -71,6 +71,6 @@ def test_benchmarks_judge_us_too() -> None:
     assert found["failed"] == 0
     assert geometry.judge((1.0, np.eye(3, 2), np.zeros(2)), 2.0, np.array([0.2, 0.2])) == "area"
     assert geometry.judge((0.5, np.eye(3, 2), np.zeros(2)), 0.5, np.array([0.9, 0.9])) == "truth lost"
-    assert geometry.run_batch(20, 4, None, True)["truths_lost"] == 0
+    assert geometry.run_batch(20, 4, None)["truths_lost"] == 0
     assert fleet.run(20, 3, True, True)["truths_lost"] == 0
     assert set(observer.run(1, 1)) == {"set, torch", "set, compiled", "UKF (filterpy)", "hybrid"}

@@ -7,6 +7,7 @@ that any one-sided choice must have, or along parameters that move the tied rows
 """
 
 import math
+import weakref
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
 from tests.problems import CASES, batch, paper_case, random_scene
+from tests.reference_clip import Rings
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.identification.critical_region import critical_region
 from torchfsid.identification.inverse_optimal import inverse_optimal_set
@@ -22,7 +24,6 @@ from torchfsid.robots.barriers import ClassK, CollisionAvoidance
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.tasks import GoalTask
-from torchfsid.sets.clipping import clip
 from torchfsid.sets.polygon import Polygon
 
 OUTSIDE = torch.tensor([[4.0, 3.5], [-3.0, 5.0]], dtype=torch.float64).repeat(100, 1)
@@ -47,7 +48,7 @@ def seed():
 def clipped_box(A: Tensor, b: Tensor) -> Polygon:
     half = torch.full((len(b), 2), 2.0, dtype=torch.float64)
     time = torch.zeros(len(b), dtype=torch.float64)
-    return clip(Polygon.from_box(-half, half), A, b, time, torch.zeros(b.shape, dtype=torch.long)).body
+    return Polygon.from_box(-half, half).clip(A, b, time, torch.zeros(b.shape, dtype=torch.long), 1000).body
 
 
 def ragged_rows() -> tuple[Tensor, Tensor]:
@@ -108,6 +109,88 @@ def test_nearest_point_and_metric():
     inner = torch.zeros(2, 2, dtype=torch.float64, requires_grad=True)
     jacobian = torch.autograd.functional.jacobian(polygon.nearest, inner)
     assert torch.equal(jacobian[0, :, 0], torch.eye(2, dtype=torch.float64))
+
+
+# Which rows a derivative belongs to ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("upper", "row", "slopes"),
+    [
+        ([1.0, 1.0], [1.0, 1.0], (1.0, 1 / 3, 1.0)),
+        ([1.0, 3.0], [1.0, 1.0], (1.0, 1 / 3, 1.0)),  # through one corner
+        ([1.0, 2.0], [1.0, 2.0], (0.5, 1 / 3, 1.0)),
+    ],
+)
+def test_a_cut_through_a_corner_has_the_derivative_of_its_facet(upper: list, row: list, slopes: tuple):
+    """V, c_x and h(1, 1): a triangle with legs b / row; at b = 1 the derivatives from both sides, or one of the two."""
+    b = torch.ones(1, 1, dtype=torch.float64, requires_grad=True)
+    corner = torch.tensor([upper], dtype=torch.float64)
+    polygon = Polygon.from_box(torch.zeros_like(corner), corner)
+    A, nothing = torch.tensor([[row]], dtype=torch.float64), torch.zeros(1, 1, dtype=torch.long)
+    triangle = polygon.clip(A, b, torch.zeros(1, dtype=torch.float64), nothing, 8).body
+    asked = triangle.volume(), triangle.centroid()[:, 0], triangle.support(torch.ones(1, 1, 2).double())
+    found = [torch.autograd.grad(answer.sum(), b, retain_graph=True)[0].item() for answer in asked]
+    assert found == pytest.approx(slopes, rel=1e-12)
+
+
+def test_a_thin_set_far_away_sweeps_with_all_of_its_facets():
+    """An integer parallelogram 1e-2 wide at 1e6: dV/db of each edge is its length over the length of its row."""
+    A = torch.tensor([[[100.0, 1.0], [-100.0, -1.0], [1.0, 100.0], [-1.0, -100.0]]], dtype=torch.float64)
+    b = torch.tensor([[101e6 + 1, -101e6, 101e6 + 1, -101e6]], dtype=torch.float64, requires_grad=True)
+    corner = torch.full((1, 2), 1e6, dtype=torch.float64)
+    polygon = Polygon.from_box(corner - 4e-9, corner + 1.0)
+    cut = polygon.clip(A, b, torch.zeros(1, dtype=torch.float64), torch.arange(4).expand(1, 4), 8).body
+    (slopes,) = torch.autograd.grad(cut.volume().sum(), b)
+    ends = cut.corners[0, : int(cut.count)]
+    for row, source in zip(cut.A[0], cut.source[0], strict=True):
+        if source >= 0:
+            edge = int((cut.source[0] == source).nonzero())
+            length = (ends[(edge + 1) % len(ends)] - ends[edge]).norm()
+            assert slopes[0, source].item() == pytest.approx(float(length / row.norm()), rel=1e-6)
+    assert (slopes > 0).any()
+
+
+def test_gradients_are_those_of_clips_in_torch():
+    """Area and centroid after ten clips, down to a size of 1e-6."""
+    rng, count, size = np.random.default_rng(8), 50, 10.0
+    truth, corner = torch.from_numpy(rng.uniform(-1, 1, (count, 1, 2))), torch.full((count, 2), 3.0).double()
+    rows, polygon, rings = [], Polygon.from_box(-corner, corner), Rings.boxes(-corner, corner)
+    for _ in range(10):
+        angle, distance = rng.uniform(0, 2 * np.pi, (count, 6)), rng.uniform(0.2, 1, (count, 6)) * size
+        A = torch.from_numpy(np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+        b = (A * truth).sum(-1) + torch.from_numpy(distance)
+        rows += [A.requires_grad_(), b.requires_grad_()]
+        polygon = polygon.clip(A, b, torch.zeros(count).double(), torch.zeros(count, 6).long(), 32).body
+        rings, size = rings.clip(A, b), 0.2 * size
+    torch.testing.assert_close(polygon.volume(), rings.area(), rtol=1e-9, atol=0)
+    for mine, other in ((polygon.volume().log(), rings.area().log()), (polygon.centroid(), rings.centroid())):
+        found, expected = (torch.autograd.grad(x.sum(), rows, retain_graph=True, materialize_grads=True)
+                           for x in (mine, other))  # fmt: skip
+        scale = max(float(slope.abs().max()) for slope in expected)
+        for slope, other_slope in zip(found, expected, strict=True):
+            torch.testing.assert_close(slope, other_slope, rtol=0, atol=1e-8 * scale)
+
+
+def test_memory_is_facets():
+    """After 300 differentiable clips, few rows are kept, and the graphs of clips that left no facet are gone."""
+    rng, graphs = np.random.default_rng(9), []
+    corner = torch.full((3, 2), 9.0, dtype=torch.float64)
+    polygon, b = Polygon.from_box(-corner, corner), torch.zeros(3, 4).double().requires_grad_()
+    for k in range(300):
+        angle = rng.uniform(0, 2 * np.pi, (3, 4))
+        A = torch.from_numpy(np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+        right = b + 8 * 0.99**k
+        graphs.append(weakref.ref(right))
+        polygon = polygon.clip(A, right, torch.zeros(3).double(), torch.zeros(3, 4).long(), 12).body
+        assert polygon.sheets.rows <= 2 * polygon.label.numel()
+    del right
+    assert sum(graph() is not None for graph in graphs) <= 36
+    assert len(polygon.sheets.sheets) <= 36
+    assert torch.autograd.grad(polygon.volume().sum(), b)[0].abs().sum() > 0
+    fresh = polygon.clip(torch.zeros(3, 1, 2).double(), torch.ones(3, 1).double(), torch.zeros(3).double(),
+                         torch.zeros(3, 1).long(), 12).body  # fmt: skip
+    assert fresh is polygon
 
 
 # The sets -----------------------------------------------------------------------------------------------------------
@@ -187,9 +270,8 @@ def test_area_as_a_function_of_positions_and_control(kind: str):
             theta = inverse_optimal_set(safe_controls, u, C, d, NoiseBound(0.05))
         half = torch.full((1, 2), 6.0, dtype=torch.float64)
         source = torch.zeros(theta.b.shape, dtype=torch.long)
-        return clip(
-            Polygon.from_box(-half, half), theta.A, theta.b, torch.zeros(1, dtype=torch.float64), source
-        ).body.volume()
+        time = torch.zeros(1, dtype=torch.float64)
+        return Polygon.from_box(-half, half).clip(theta.A, theta.b, time, source, 1000).body.volume()
 
     assert 1 < area(x, bodies, u) < 100
     assert gradcheck(area, (x, bodies, u))

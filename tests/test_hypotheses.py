@@ -26,6 +26,8 @@ from torchfsid.sets.feasible_set import FeasibleSet
 AVOIDANCE = CollisionAvoidance(ClassK(2.0), safety_distance=0.5, neighbour_velocity="current")
 TASKS: dict[str, Task] = {"orbit": OrbitTask(0.8), "velocity": VelocityTask(), "goal": GoalTask(0.9)}
 TRUTHS = {"orbit": [0.3, -0.2], "velocity": [0.5, 0.3], "goal": [-1.0, 1.0]}
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 BODIES = ["orbiter", "cruiser", "homer"]
 CONFIG = {
     "tasks": [

@@ -19,7 +19,6 @@ from torchfsid.halfspaces import Halfspaces
 from torchfsid.identification.critical_region import critical_region
 from torchfsid.identification.inverse_optimal import inverse_optimal_set
 from torchfsid.robots.bounds import NoiseBound
-from torchfsid.sets.clipping import clip
 from torchfsid.sets.polygon import Polygon
 
 FAN_EXCESS = 1 / math.cos(math.pi / 16)
@@ -144,7 +143,7 @@ def test_without_noise_it_is_inside_the_critical_region():
 
 def clipped(theta: Halfspaces, around: Tensor, half: float) -> Polygon:
     box, time = Polygon.from_box(around - half, around + half), theta.b.new_zeros(len(theta.b))
-    return clip(box, theta.A, theta.b, time, torch.zeros_like(theta.b).long()).body
+    return box.clip(theta.A, theta.b, time, torch.zeros_like(theta.b).long(), most=theta.rows + 4).body
 
 
 CONES = {

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 import torch
 
-from experiments.config import SceneConfig
-from experiments.recording import Scene, simulate_scene
-from experiments.sweep_config import load_sweep
+from experiments.kinds import load
+from experiments.runs.config import SceneConfig
+from experiments.runs.recording import SimulatedScene, simulate_scene
+from experiments.sweeps.config import SweepConfig
 from experiments.teams import TeamConfig
-from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.identification.evidence import ObservationModel, evidence
 from torchfsid.sets.feasible_set import FeasibleSet
 
 MONTE_CARLO = Path(__file__).parents[1] / "configs" / "monte_carlo.yaml"
@@ -31,7 +32,9 @@ def _shapes_are_checked_elsewhere() -> Iterator[None]:
 def scene(shape: str, **noise: float) -> SceneConfig:
     """A short run of the Monte Carlo study."""
     errors = {"velocity": 0.02, "position": 0.01, **noise}
-    drawn = load_sweep(MONTE_CARLO).scene(725).model_dump()
+    sweep = load(MONTE_CARLO)
+    assert isinstance(sweep, SweepConfig)
+    drawn = sweep.scene(725).model_dump()
     bound = {"velocity": errors["velocity"] + 1e-9, "position": errors["position"], "neighbour_velocity": 0.02}
     changed = {"duration": 1.0, "measurement_noise": {**errors, "shape": shape}, "noise": bound}
     return SceneConfig.model_validate({**drawn, **changed})
@@ -64,12 +67,13 @@ def test_the_adversary_leaves_less_room_than_chance(noise: dict[str, float]):
     assert worst.median() < 0.2 * chance.median()
 
 
-def room(measured: Scene) -> torch.Tensor:
+def room(measured: SimulatedScene) -> torch.Tensor:
     """Distance of each true goal to the nearest half-space of each sample, where there is one [m]."""
     recording = measured.recording()
     prior = FeasibleSet.from_box(recording.goals - 9.0, recording.goals + 9.0)
-    observer = SetMembershipObserver(recording.task, recording.barriers, prior, noise=measured.config.noise.build())
-    rows = torch.stack([observer.read(seen).omega.slack(recording.goals).amin(-1) for seen in recording.measurements])
+    model = ObservationModel(recording.task, recording.barriers, noise=measured.config.noise.build())
+    said = [evidence(model, prior, seen).omega for seen in recording.measurements]
+    rows = torch.stack([omega.slack(recording.goals).amin(-1) for omega in said])
     return rows[rows < 0.99]  # padding has a slack of 1
 
 

@@ -17,7 +17,6 @@ from torchfsid.halfspaces import Halfspaces
 from torchfsid.identification.critical_region import critical_region
 from torchfsid.identification.inverse_optimal import inverse_optimal_set
 from torchfsid.robots.bounds import NoiseBound
-from torchfsid.sets.clipping import clip
 from torchfsid.sets.polygon import Polygon
 
 BOX = 8.0
@@ -50,7 +49,7 @@ def supports(theta: Halfspaces, around: Tensor) -> Tensor:
 
 
 def clipped(A: Tensor, b: Tensor, start: Polygon) -> Polygon:
-    return clip(start, A, b, b.new_zeros(len(b)), torch.zeros(b.shape, dtype=torch.long)).body
+    return start.clip(A, b, b.new_zeros(len(b)), torch.zeros(b.shape, dtype=torch.long), 1000).body
 
 
 def box(count: int, half: float) -> Polygon:

@@ -1,6 +1,7 @@
 """Fleets among their nearest bodies: the right ones are found, and no row left out can have mattered."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -53,13 +54,104 @@ def test_the_nearest_are_found(count: int, within: float) -> None:
 
 def test_wrong_use_is_refused() -> None:
     x = places(1, 4)
-    with pytest.raises(InputError, match="count"):
-        nearest_bodies(0.0, x, count=0)
-    with pytest.raises(InputError, match="finite"):
-        nearest_bodies(0.0, x / 0, count=2)
     barrier = CollisionAvoidance(ClassK(1.0, power=0.3), safety_distance=0.3)
     with pytest.raises(InputError, match="power"):
         left_out_inactive([barrier], nearest_bodies(0.0, x, x, count=2), torch.tensor(0.1), torch.tensor(0.0))
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        ({"count": 0}, "count"),
+        ({"count": 2.5}, "count"),
+        ({"count": True}, "count"),
+        ({"count": "2"}, "count"),
+        ({"within": 0.0}, "within"),
+        ({"within": math.nan}, "within"),
+        ({"robots": [99]}, "robots: .* got 99"),
+        ({"robots": [-1]}, "robots: .* got -1"),
+        ({"robots": [1.5]}, "robots"),
+        ({"u": torch.zeros(3, 2)}, "u"),
+        ({"previous_u": torch.zeros(4)}, "previous_u"),
+        ({"radius": torch.zeros(3)}, "radius"),
+        ({"radius": "large"}, "radius"),
+        ({"position_error": torch.zeros(5)}, "position_error"),
+        ({"position_error": torch.tensor([0.0, -1.0, 0.0, 0.0])}, "position_error"),
+        ({"velocity_error": torch.zeros(4, 2)}, "velocity_error"),
+        ({"seen": torch.ones(4)}, "seen"),
+        ({"seen": torch.ones(3, dtype=torch.bool)}, "seen"),
+        ({"x": torch.tensor([[0.0, 0.0], [1.0, math.nan], [2.0, 0.0], [3.0, 0.0]])}, "x: .* of body 1"),
+        ({"x": np.zeros(4)}, "x"),
+        ({"x": [["a", "b"]]}, "x"),
+    ],
+)
+def test_wrong_arguments_are_named(wrong: dict[str, Any], named: str) -> None:
+    with pytest.raises(InputError, match=f"^{named}"):
+        nearest_bodies(**{"t": 0.0, "x": places(1, 4), "count": 2} | wrong)
+
+
+def test_arrays_are_as_good_as_tensors() -> None:
+    x, radius = places(1, 6), torch.rand(6, dtype=torch.float64)
+    seen = torch.tensor([True, True, False, True, True, True])
+    names = "x", "bodies", "present", "observed", "body_radii", "body_velocities"
+    of_tensors = nearest_bodies(0.0, x, 2 * x, count=2, radius=radius, seen=seen)
+    of_arrays = nearest_bodies(0.0, x.numpy(), 2 * x.numpy(), count=2, radius=radius.numpy(), seen=seen.numpy())
+    for name in names:
+        assert torch.equal(getattr(of_tensors, name), getattr(of_arrays, name)), name
+
+
+def test_bodies_that_were_not_seen_are_no_obstacles() -> None:
+    """As in `Measurement.of_team`; their numbers may be anything."""
+    x, u, errors = places(2, 12), places(3, 12), 0.1 * torch.rand(12, dtype=torch.float64)
+    seen = torch.arange(12) % 3 != 1
+    x[~seen], u[~seen] = torch.nan, torch.inf
+    few = nearest_bodies(0.0, x, u, count=11, seen=seen, position_error=errors, velocity_error=2 * errors)
+    team = Measurement.of_team(0.0, x, u, seen=seen, position_error=errors, velocity_error=2 * errors)
+    assert few.observed is not None
+    assert torch.equal(few.observed, seen)
+    assert few.body_position_error is not None
+    assert few.body_velocity_error is not None
+    for robot in seen.nonzero().flatten().tolist():
+        shown, there = few.present[robot], team.present[robot]
+        assert int(shown.sum()) == int(there.sum()) == 7
+        mine = torch.cat([few.bodies[robot], few.body_position_error[robot, :, None]], -1)[shown]
+        other = torch.cat([team.bodies[robot], errors[:, None]], -1)[there]
+        assert torch.equal(mine[mine[:, 0].argsort()], other[other[:, 0].argsort()])
+        assert torch.equal(few.body_velocity_error[robot], 2 * few.body_position_error[robot])
+    assert torch.equal(few.position_error[seen], errors[seen])  # type: ignore[index]
+    nobody = nearest_bodies(0.0, x, u, count=2, seen=torch.zeros(12, dtype=torch.bool))
+    assert not nobody.present.any()
+
+
+@pytest.mark.parametrize("distance", ["squared", "euclidean"])
+@pytest.mark.parametrize("neighbour_velocity", ["none", "current"])
+def test_errors_bring_bodies_nearer(distance: str, neighbour_velocity: str) -> None:
+    """60 random fleets, moved by their errors: where the rule holds, the true rows of bodies without a slot are off."""
+    rng, proven, bound = np.random.default_rng(4), 0, 0.05
+    for _ in range(60):
+        x, u = torch.from_numpy(rng.uniform(-2, 2, (12, 2))), torch.from_numpy(rng.normal(size=(12, 2)) * 0.3)
+        errors = torch.from_numpy(rng.uniform(0, 0.15, 12))
+        barrier = CollisionAvoidance(
+            ClassK(float(rng.uniform(0.3, 3))), 0.3, distance=distance, neighbour_velocity=neighbour_velocity
+        )
+        few = nearest_bodies(0.0, x, u, count=3, position_error=errors, velocity_error=errors)
+        sure = left_out_inactive([barrier], few, bound + errors, errors)
+        moved = x + errors.unsqueeze(-1) * torch.from_numpy(_directions(rng, 12))
+        truth = Measurement.of_team(0.0, moved, u + errors.unsqueeze(-1) * torch.from_numpy(_directions(rng, 12)))
+        assert few.left_out is not None
+        has_slot = torch.zeros(12, 12, dtype=torch.bool)
+        for i in range(12):
+            has_slot[i] = (x.unsqueeze(0) == few.bodies[i].unsqueeze(1)).all(-1).any(0)
+        slack = barrier(truth).slack(truth.u).masked_fill(has_slot | ~truth.present, torch.inf)  # type: ignore[arg-type]
+        assert (slack[sure] > bound).all()
+        proven += int(sure.sum())
+    assert 20 < proven < 700
+
+
+def _directions(rng: np.random.Generator, count: int) -> np.ndarray:
+    angle = rng.uniform(0, 2 * np.pi, count)
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 @pytest.mark.parametrize("distance", ["squared", "euclidean"])

@@ -82,6 +82,8 @@ WRONG = {
     ": column 'vx': expected numbers, it holds bool": {"vx": [True, False, True, False]},
     ": column 'robot': expected text or whole numbers, it holds double": {"robot": [0.0, 1.0, 0.0, 1.0]},
     " row 4: column 'robot' is empty": {"robot": ["0", "1", "0", None]},
+    " row 2: column 'robot': a name with a NUL: 'a\\x00b'": {"robot": ["0", "a\0b", "0", "a\0b"]},
+    ": column 't': the median step is 5e+07 s; stamps in nanoseconds?": {"t": [0, 0, 50_000_000, 50_000_000]},
     " row 3: times must not decrease, got 0.05 after 0.1": {"t": [0.0, 0.1, 0.05, 0.1]},
     " row 2: robot '0' has another row at t = 0.0": {"robot": ["0", "0", "0", "1"]},
     " row 3: the radius of robot '0' changes from 0.2 to 0.3": {"radius": [0.2, 0.25, 0.3, 0.25]},

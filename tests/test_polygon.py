@@ -3,10 +3,8 @@
 A row's exact counterpart is the very rationals that its floats are: what differs is the library's rounding, only.
 """
 
-import itertools
 import math
 from collections import Counter
-from collections.abc import Iterator
 from fractions import Fraction
 
 import numpy as np
@@ -23,24 +21,15 @@ from tests.problems import (
     exact_area,
     exact_box,
     exact_centroid,
+    exact_inscribed_radius,
     exact_intersection,
     exactly_feasible,
     solve_qp,
 )
-from torchfsid.kernels import compiled
 from torchfsid.outcome import Outcome
-from torchfsid.sets.clipping import Clipped, clip, merge
-from torchfsid.sets.polygon import Polygon, round_off
+from torchfsid.sets.body import Clipped
+from torchfsid.sets.polygon import Polygon
 from torchfsid.tolerances import ROUND_OFF
-
-
-@pytest.fixture(scope="module", autouse=True, params=["torch", "compiled"])
-def way(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Everything in this file holds for both ways of computing it."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compiled, "installed", lambda: request.param == "compiled")
-        yield
-
 
 BOX = 10.0
 """Half the side of the first box: the size that round-off is measured against."""
@@ -54,11 +43,12 @@ def boxes(count: int, half: float = BOX) -> Polygon:
     return Polygon.from_box(tensor(np.full((count, 2), -half)), tensor(np.full((count, 2), half)))
 
 
-def cut(polygon: Polygon, A: np.ndarray | Tensor, b: np.ndarray | Tensor, time: float = 0.0) -> Clipped:
+def cut(
+    polygon: Polygon, A: np.ndarray | Tensor, b: np.ndarray | Tensor, time: float = 0.0, most: int = 1000
+) -> Clipped:
     A, b = torch.as_tensor(A), torch.as_tensor(b)
-    return clip(
-        polygon, A, b, torch.full((len(b),), time, dtype=torch.float64), torch.arange(b.shape[1]).expand(b.shape)
-    )
+    stamp, source = torch.full((len(b),), time, dtype=torch.float64), torch.arange(b.shape[1]).expand(b.shape)
+    return polygon.clip(A, b, stamp, source, most)
 
 
 def unit(angles: np.ndarray) -> np.ndarray:
@@ -166,11 +156,12 @@ def test_rows_that_touch_within_round_off_change_nothing():
     before = boxes(128)
     normals = tensor(unit(rng.uniform(0, 2 * np.pi, (128, 100))))
     support = before.support(normals)
-    depth = round_off(normals, support, before.reach) * (1 + 0.005 * tensor(rng.uniform(-1, 1, (128, 100))))
-    after = cut(before, normals, support - depth).body
-    assert torch.allclose(after.volume(), before.volume(), rtol=1e-12)
-    assert torch.allclose(after.chebyshev()[1], before.chebyshev()[1], rtol=1e-12)
-    assert torch.allclose(merge(after, 6).volume(), before.volume(), rtol=1e-12)
+    room = ROUND_OFF * (normals.abs() * before.reach.unsqueeze(1)).sum(-1) + ROUND_OFF * support.abs()
+    rows = normals, support - room * (1 + 0.005 * tensor(rng.uniform(-1, 1, (128, 100))))
+    for most in (1000, 6):
+        after = cut(before, *rows, most=most).body
+        assert torch.allclose(after.volume(), before.volume(), rtol=1e-12)
+        assert torch.allclose(after.chebyshev()[1], before.chebyshev()[1], rtol=1e-12)
 
 
 def test_rows_of_a_disc_accumulate_without_overflow():
@@ -212,26 +203,13 @@ def test_chebyshev_disc_is_that_of_a_linear_programme():
 
 @pytest.mark.parametrize("width", [1.0, 1e-3, 1e-6, 1e-9])
 def test_chebyshev_radius_of_thin_sets_is_exact(width: float):
-    """In rationals, by duality: the least lambda.b over triples with lambda >= 0, sum lambda (a, |a|) = (0, 1)."""
     rng = np.random.default_rng(12)
     polygon = cut(boxes(20), *rows_around(rng, rng.uniform(-5, 5, (20, 2)), 6, width, needle=True)).body
     radius = polygon.chebyshev()[1]
     for i in range(20):
         n = int(polygon.count[i])
-        rows = [(*exact(row), Fraction(float(torch.linalg.vector_norm(row)))) for row in polygon.A[i, :n]]
-        triples = itertools.combinations(zip(rows, exact(polygon.b[i, :n]), strict=True), 3)
-        bounds = [bound for bound in map(inscribed_bound, triples) if bound is not None]
-        assert float(radius[i]) == pytest.approx(float(min(bounds)), abs=4 * ROUND_OFF * BOX)
-
-
-def inscribed_bound(triple: tuple) -> Fraction | None:
-    """lambda.b of three rows (a, |a|), or None if there is no such lambda >= 0."""
-    ((p, q, u), b1), ((r, s, v), b2), ((x, y, w), b3) = triple
-    weights = (r * y - s * x, x * q - y * p, p * s - q * r)  # orthogonal to both columns of the three a
-    total = weights[0] * u + weights[1] * v + weights[2] * w
-    if total == 0 or any(weight / total < 0 for weight in weights):
-        return None
-    return (weights[0] * b1 + weights[1] * b2 + weights[2] * b3) / total
+        expected = exact_inscribed_radius(polygon.A[i, :n].numpy(), polygon.b[i, :n].numpy())
+        assert float(radius[i]) == pytest.approx(expected, abs=4 * ROUND_OFF * BOX)
 
 
 @pytest.mark.parametrize("euclidean", [True, False], ids=["euclidean", "metric"])
@@ -271,8 +249,8 @@ def assert_outer(outer: Polygon, inner: Polygon) -> None:
 @pytest.mark.parametrize(("most", "growth"), [(32, 0.004), (24, 0.007), (8, 0.08), (4, 0.6)])
 def test_merge_is_outer_and_small(most: int, growth: float):
     """100 random tangents of a disc; `growth` is measured: a regular polygon of 24 sides has 0.6 % more than a disc."""
-    polygon = cut(boxes(10), unit(np.random.default_rng(5).uniform(0, 2 * np.pi, (10, 100))), np.ones((10, 100))).body
-    merged = merge(polygon, most)
+    rows = unit(np.random.default_rng(5).uniform(0, 2 * np.pi, (10, 100))), np.ones((10, 100))
+    polygon, merged = cut(boxes(10), *rows).body, cut(boxes(10), *rows, most=most).body
     assert (merged.count <= most).all()
     assert_outer(merged, polygon)
     grown = merged.volume() / polygon.volume() - 1
@@ -285,14 +263,18 @@ def test_merge_of_needles_is_outer(thickness: float):
     """60 tangents of a flat ellipse whose directions differ by less than its thickness."""
     rng = np.random.default_rng(6)
     normals = unit(np.pi / 2 * (-1.0) ** np.arange(60) + rng.uniform(-1, 1, (5, 60)) * thickness)
-    polygon = cut(boxes(5), normals, 5 * np.hypot(normals[..., 0], thickness * normals[..., 1])).body
+    rows = normals, 5 * np.hypot(normals[..., 0], thickness * normals[..., 1])
+    polygon, merged = cut(boxes(5), *rows).body, cut(boxes(5), *rows, most=32).body
     assert (polygon.count > 32).all()
-    assert_outer(merge(polygon, 32), polygon)
+    assert (merged.count <= 32).all()
+    assert_outer(merged, polygon)
 
 
 def test_merge_leaves_a_parallelogram_alone():
     """Without any of its edges a parallelogram is unbounded: three of its rows make no outer polygon."""
-    assert_outer(merge(boxes(1), 3), boxes(1))
+    halved = cut(boxes(1), np.array([[[1.0, 0.0]]]), np.zeros((1, 1)), most=3).body
+    assert halved.count.item() == 4
+    assert halved.volume().item() == pytest.approx(2 * BOX * BOX)
 
 
 # Emptiness, three-way -----------------------------------------------------------------------------------------------
@@ -304,8 +286,11 @@ def test_outcome_when_sets_touch():
     result = cut(boxes(5, half=1.0), rows, np.array([[-2.0], [-1.0], [-2.0 - 1e-13], [-2.0 + 1e-13], [-2.0]]))
     names = [Outcome(int(outcome)).name for outcome in result.outcome]
     assert names == ["UNDECIDED", "UNDECIDED", "EMPTY", "NONEMPTY", "EMPTY"]
-    assert result.body.volume()[[0, 1, 2, 4]].tolist() == [4.0] * 4
-    assert result.shrunk.tolist() == [False, False, False, True, False]
+    area, diameter = result.body.volume(), result.body.diameter()
+    assert area[[2, 4]].tolist() == [4.0] * 2  # of empty ones the polygon before
+    assert area[[0, 1, 3]].max() < 1e-12
+    assert diameter[[0, 1, 3]].tolist() == pytest.approx([0.0, 2.0, 0.0], abs=1e-12)
+    assert result.shrunk.tolist() == [True, True, False, True, False]
 
 
 def test_empty_intersection_leaves_the_polygon_as_it_was():

@@ -1,117 +1,33 @@
-"""Checks 3 to 7 on polytopes, p = 1 and p > 2: exact rationals, invariances, the truth kept and no growth, thin sets,
-batch equals loop; volumes that are known or must add up; linear programmes; optimality; the proof that a set is empty.
+"""Checks 3 to 7 on polytopes, p = 1 and p > 2: exact rationals, the proof that a set is empty, the truth kept and no
+growth, thin sets, invariances, batch equals loop.
 """
 
-import itertools
 import math
 from fractions import Fraction
 
 import numpy as np
 import pytest
 import torch
-from scipy.optimize import linprog
-from scipy.spatial import ConvexHull
-from torch import Tensor
 
-from torchfsid.errors import SolverError
+from tests.polytopes import (
+    BOX,
+    DIMENSIONS,
+    box,
+    cut,
+    exact_vertices,
+    frame,
+    points_of,
+    random_set,
+    rows_around,
+    rows_of,
+    solve_exactly,
+    tensor,
+    width_along,
+)  # fmt: skip
 from torchfsid.outcome import Outcome
-from torchfsid.sets import clipping
-from torchfsid.sets.body import Clipped
-from torchfsid.sets.polygon import PRIOR, Polygon
-from torchfsid.sets.polytope import Polytope, clip_polytope, merge_polytope
-
-BOX = 10.0
-"""Half the side of the boxes that the sets begin with: the size their round-off is measured against."""
-
-DIMENSIONS = [1, 3, 4, 5]
-
-
-def tensor(values: object) -> Tensor:
-    return torch.as_tensor(np.asarray(values, dtype=float))
-
-
-def box(p: int, half: float = BOX, count: int = 1) -> Polytope:
-    return Polytope.from_box(tensor(np.full((count, p), -half)), tensor(np.full((count, p), half)))
-
-
-def cut(polytope: Polytope, A: np.ndarray, b: np.ndarray, time: float = 0.0) -> Clipped:
-    """Clip by rows (R, p), the same for every item, or (B, R, p)."""
-    B = len(polytope.count)
-    rows, right = tensor(A).expand(B, *A.shape[-2:]), tensor(b).expand(B, b.shape[-1])
-    stamp = torch.full((B,), time, dtype=torch.float64)
-    return clip_polytope(polytope, rows, right, stamp, torch.arange(b.shape[-1]).expand(right.shape))
-
-
-def rows_of(polytope: Polytope, item: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    count = int(polytope.count[item])
-    return polytope.A[item, :count].numpy(), polytope.b[item, :count].numpy()
-
-
-def points_of(polytope: Polytope, item: int = 0) -> np.ndarray:
-    return polytope.vertices[item, : int(polytope.vertex_count[item])].numpy()
-
-
-def rows_around(rng: np.random.Generator, truth: np.ndarray, rows: int, slack: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of all scales that hold at `truth`, their boundaries at about `slack` from it."""
-    A = rng.normal(size=(rows, len(truth))) * np.exp(rng.normal(size=(rows, 1)))
-    return A, A @ truth + slack * rng.exponential(size=rows) * np.linalg.norm(A, axis=1)
-
-
-def random_set(
-    rng: np.random.Generator, p: int, rows: int = 8, width: float = 1.0
-) -> tuple[Polytope, np.ndarray, np.ndarray]:
-    """A set, and all the rows that made it; below width 1, two rows close in on it to about `width`."""
-    truth = rng.uniform(-0.6 * BOX, 0.6 * BOX, p)
-    A, b = rows_around(rng, truth, rows, 3.0)
-    if width < 1:
-        A[1] = -A[0] + 0.01 * width * np.linalg.norm(A[0]) * rng.normal(size=p)
-        b[:2] = A[:2] @ truth + width / 2 * np.linalg.norm(A[:2], axis=1)
-    before = box(p)
-    after = cut(before, A, b)
-    assert after.outcome == Outcome.NONEMPTY
-    sides, ends = rows_of(before)
-    return after.body, np.vstack([A, sides]), np.append(b, ends)
-
-
-def frame(body: Polytope) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Centre, axes (in rows) and scale: z = centre + (y * scale) axes."""
-    points, centre = points_of(body), body.centroid()[0].numpy()
-    _, spread, axes = np.linalg.svd(points - centre, full_matrices=False)
-    return centre, axes, spread / math.sqrt(len(points))
-
-
-def width_along(points: np.ndarray, direction: np.ndarray) -> float:
-    return float(np.ptp(points @ direction))
-
-
-# Exact rationals ----------------------------------------------------------------------------------------------------
-
-
-def solve_exactly(matrix: list[list[Fraction]]) -> list[Fraction] | None:
-    """Gauss-Jordan on (p, p + 1); None if singular."""
-    rows, p = [list(row) for row in matrix], len(matrix)
-    for k in range(p):
-        pivot = next((i for i in range(k, p) if rows[i][k] != 0), None)
-        if pivot is None:
-            return None
-        rows[k], rows[pivot] = rows[pivot], rows[k]
-        rows[k] = [entry / rows[k][k] for entry in rows[k]]
-        for i in range(p):
-            if i != k and rows[i][k] != 0:
-                factor = rows[i][k]
-                rows[i] = [a - factor * b for a, b in zip(rows[i], rows[k], strict=True)]
-    return [row[-1] for row in rows]
-
-
-def exact_vertices(A: np.ndarray, b: np.ndarray) -> list[list[Fraction]]:
-    """All vertices of {z : A z <= b}, each float taken as the rational number that it is."""
-    rows = [[Fraction(x) for x in row] + [Fraction(c)] for row, c in zip(A.tolist(), b.tolist(), strict=True)]
-    found = []
-    for chosen in itertools.combinations(rows, A.shape[1]):
-        z = solve_exactly(list(chosen))
-        if z is not None and all(sum(a * x for a, x in zip(row, z, strict=False)) <= row[-1] for row in rows):
-            found.append(z)
-    return found
+from torchfsid.sets.body import PRIOR
+from torchfsid.sets.polygon import Polygon
+from torchfsid.sets.polytope import Polytope
 
 
 @pytest.mark.parametrize("width", [1.0, 1e-3, 1e-6, 1e-9])
@@ -192,82 +108,6 @@ def test_rows_that_meet_in_the_truth_are_never_called_empty(p: int) -> None:
     assert undecided > 0
 
 
-# Volumes that are known, and volumes that must add up -----------------------------------------------------------------
-
-
-def corner(p: int) -> tuple[np.ndarray, np.ndarray]:
-    """{z >= 0, sum z <= 1}, of volume 1 / p!, centroid 1 / (p + 1) and inradius 1 / (p + sqrt p)."""
-    return np.vstack([-np.eye(p), np.ones(p)]), np.append(np.zeros(p), 1.0)
-
-
-@pytest.mark.parametrize("p", [1, 2, 3, 4, 5, 6])
-def test_simplex_box_and_cross_polytope_have_their_known_measures(p: int) -> None:
-    simplex = cut(box(p), *corner(p)).body
-    assert (int(simplex.count), int(simplex.vertex_count)) == (p + 1, p + 1)
-    assert simplex.volume().item() == pytest.approx(1 / math.factorial(p), rel=1e-13)
-    assert simplex.centroid()[0].numpy() == pytest.approx(np.full(p, 1 / (p + 1)), abs=1e-14)
-    assert simplex.diameter().item() == pytest.approx(1.0 if p == 1 else math.sqrt(2), rel=1e-14)
-    centre, radius = simplex.chebyshev()
-    assert radius.item() == pytest.approx(1 / (p + math.sqrt(p)), rel=1e-13)
-    assert centre[0].numpy() == pytest.approx(np.full(p, radius.item()), abs=1e-14)
-
-    sides = np.arange(1.0, p + 1)
-    block = Polytope.from_box(tensor(-sides)[None], tensor(sides)[None])
-    assert block.volume().item() == pytest.approx(2**p * math.factorial(p), rel=1e-13)
-    assert block.chebyshev()[1].item() == pytest.approx(1.0, rel=1e-13)
-    assert block.diameter().item() == pytest.approx(2 * np.linalg.norm(sides), rel=1e-14)
-
-    # 2^p facets, of which half meet in each of the 2 p vertices: nothing simple about it.
-    cross = cut(box(p), np.array(list(itertools.product([-1.0, 1.0], repeat=p))), np.ones(2**p)).body
-    assert (int(cross.count), int(cross.vertex_count)) == (2**p, 2 * p)
-    assert cross.volume().item() == pytest.approx(2**p / math.factorial(p), rel=1e-12)
-    assert cross.chebyshev()[1].item() == pytest.approx(1 / math.sqrt(p), rel=1e-12)
-    assert cross.centroid()[0].numpy() == pytest.approx(np.zeros(p), abs=1e-13)
-
-
-@pytest.mark.parametrize(("p", "width"), [(1, 1e-6), (3, 1.0), (3, 1e-6), (4, 1.0), (4, 1e-6), (5, 1.0), (6, 1.0)])
-def test_the_two_parts_of_a_set_add_up_to_it(p: int, width: float) -> None:
-    """Volumes and first moments, cut after cut, which puts every triangulation against others."""
-    rng = np.random.default_rng([p, int(1 / width)])
-    body, _, _ = random_set(rng, p, width=width)
-    for _ in range(4):
-        point = points_of(body).T @ rng.dirichlet(np.ones(int(body.vertex_count)))
-        a = rng.normal(size=(1, p))
-        parts = [cut(body, sign * a, sign * a @ point).body for sign in (1, -1)]
-        volumes, centroids = [part.volume().item() for part in parts], [part.centroid()[0].numpy() for part in parts]
-        tolerance = 1e-11 + 1e-14 * BOX / width
-        assert sum(volumes) == pytest.approx(body.volume().item(), rel=tolerance)
-        moment = sum(volume * centroid for volume, centroid in zip(volumes, centroids, strict=True))
-        assert moment / sum(volumes) == pytest.approx(body.centroid()[0].numpy(), abs=tolerance * BOX)
-        body = parts[int(np.argmax(volumes))]
-
-
-@pytest.mark.parametrize("p", [3, 4])
-def test_rows_parallel_to_almost_round_off(p: int) -> None:
-    """Facets repeated with tilts of 1e-16 to 1e-8, as by a robot that stands still: volume and vertices stay right."""
-    for seed in range(4):
-        rng = np.random.default_rng([p, seed])
-        truth = rng.uniform(-4, 4, p)
-        body, A, b = box(p), *rows_of(box(p))
-        for _ in range(20):
-            own, ends = rows_of(body)
-            again = rng.integers(len(ends), size=4)
-            scale = np.exp(3 * rng.normal(size=(4, 1)))
-            tilt = 1 + rng.normal(size=(4, p)) * 10 ** rng.uniform(-16, -8, size=(4, 1))
-            new, slack = rows_around(rng, truth, 1, 4.0)
-            rows = np.vstack([own[again] * scale * tilt, new])
-            right = np.maximum(np.append(ends[again] * scale[:, 0], slack), rows @ truth)
-            after = cut(body, rows, right)
-            assert after.outcome != Outcome.EMPTY
-            assert after.body.volume() <= body.volume() * (1 + 1e-6)
-            body, A, b = after.body, np.vstack([A, rows]), np.append(b, right)
-        # Joggled: merging coplanar facets, Qhull's default, is wrong by per cents in four dimensions.
-        assert body.volume().item() == pytest.approx(ConvexHull(points_of(body), qhull_options="QJ").volume, rel=1e-6)
-        for direction in rng.normal(size=(5, p)):
-            bound = -linprog(-direction, A_ub=A, b_ub=b, bounds=(None, None)).fun
-            assert body.support(tensor(direction)[None, None]).item() == pytest.approx(bound, abs=1e-6)
-
-
 # Promises ----------------------------------------------------------------------------------------------------------
 
 
@@ -321,21 +161,6 @@ def test_thin_sets_keep_the_truth(p: int, width: float) -> None:
             assert (rows @ centre[0].numpy() <= right).all()
 
 
-def test_a_row_that_only_touches_is_undecided_and_not_made() -> None:
-    block = box(3, half=1.0)
-    touching = np.array([[-1.0, 0, 0], [1.0, 1, 0], [-1.0, -1, -1]])
-    for row, right in zip(touching, [-1.0, -2.0, -3.0], strict=True):
-        outside = cut(block, row[None], np.array([right]))
-        assert outside.outcome == Outcome.UNDECIDED
-        assert not outside.shrunk
-        assert outside.body.volume().item() == pytest.approx(8.0)
-        beyond = cut(block, row[None], np.array([right - 1e-9]))
-        assert beyond.outcome == Outcome.EMPTY
-        from_inside = cut(block, row[None], np.array([-right]))
-        assert from_inside.outcome == Outcome.NONEMPTY
-        assert not from_inside.shrunk
-
-
 def test_a_cut_before_the_empty_one_is_taken_back() -> None:
     block = box(3, half=1.0)
     after = cut(block, np.array([[1.0, 0, 0], [-1.0, 0, 0]]), np.array([-0.5, 0.2]), time=3.0)
@@ -360,59 +185,6 @@ def test_padding_rows_change_nothing_and_a_row_that_nothing_satisfies_empties() 
     assert impossible.outcome == Outcome.EMPTY
     assert impossible.contradiction.b[0].tolist()[0] == -1.0
     assert impossible.contradiction.b[0, 1:].isnan().all()
-
-
-# Centre, nearest point ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("width", [1.0, 1e-3, 1e-6])
-@pytest.mark.parametrize("p", DIMENSIONS)
-def test_chebyshev_ball_fits_and_none_is_larger(p: int, width: float) -> None:
-    """Against an interior-point method, in the frame of the set."""
-    for seed in range(4):
-        body, A, b = random_set(np.random.default_rng([p, seed]), p, width=width)
-        middle, radius = body.chebyshev()
-        norms = np.linalg.norm(A, axis=1)
-        assert ((b - A @ middle[0].numpy()) / norms).min() == pytest.approx(radius.item(), abs=1e-15 * BOX)
-        centre, axes, spread = frame(body)
-        rows = np.column_stack([A @ (axes.T * spread), norms * spread.min()])
-        scale = np.linalg.norm(rows, axis=1)
-        reference = linprog(
-            np.append(np.zeros(p), -1.0),
-            A_ub=rows / scale[:, None],
-            b_ub=(b - A @ centre) / scale,
-            bounds=(None, None),
-            method="highs-ipm",
-        )
-        assert radius.item() == pytest.approx(reference.x[-1] * spread.min(), rel=1e-6)
-
-
-@pytest.mark.parametrize("width", [1.0, 1e-6])
-@pytest.mark.parametrize("p", DIMENSIONS)
-@pytest.mark.parametrize("euclidean", [True, False])
-def test_nearest_point_is_in_the_set_and_optimal(p: int, width: float, euclidean: bool) -> None:
-    """Optimal: no vertex v is on the point's side, (q - z)' M (v - z) <= 0."""
-    rng = np.random.default_rng(p)
-    body, A, b = random_set(rng, p, width=width)
-    points = points_of(body)
-    factor = rng.normal(size=(p, p))
-    metric = np.eye(p) if euclidean else factor @ factor.T + 0.1 * np.eye(p)
-    for distance in (1e-6, 1e-2, 1.0, 100.0):
-        q = points[rng.integers(len(points))] + distance * rng.normal(size=p)
-        if (A @ q <= b).all():
-            continue
-        z = body.nearest(tensor(q)[None], None if euclidean else tensor(metric)[None])[0].numpy()
-        assert (A @ z <= b + 1e-15 * BOX * np.abs(A).sum(1)).all()
-        towards = metric @ (q - z)
-        noise = 1e-14 * BOX**2 * np.linalg.norm(metric) * np.linalg.cond(metric) * max(1, distance / BOX)
-        assert ((points - z) @ towards <= noise).all()
-    inside = body.centroid()
-    assert torch.equal(body.nearest(inside), inside)
-
-
-def test_a_metric_that_is_none_is_refused() -> None:
-    with pytest.raises(SolverError, match="metric"):
-        box(3).nearest(tensor([[20.0, 0, 0]]), -torch.eye(3, dtype=torch.float64)[None])
 
 
 # Invariances ---------------------------------------------------------------------------------------------------------
@@ -468,7 +240,7 @@ def test_in_the_plane_it_agrees_with_polygons() -> None:
         for _ in range(4):
             A, b = rows_around(rng, truth, 5, 2.0)
             stamp, source = torch.zeros(1, dtype=torch.float64), torch.arange(5)[None]
-            flat = clipping.clip(polygon, tensor(A)[None], tensor(b)[None], stamp, source)
+            flat = polygon.clip(tensor(A)[None], tensor(b)[None], stamp, source, 1000)
             after = cut(polytope, A, b)
             assert after.outcome == flat.outcome
             assert after.shrunk == flat.shrunk
@@ -486,60 +258,6 @@ def test_in_the_plane_it_agrees_with_polygons() -> None:
             (polytope.nearest(q, metric), polygon.nearest(q, metric)),
         ]:
             torch.testing.assert_close(one, other, rtol=1e-10, atol=1e-12)
-
-
-# Merging, batches ----------------------------------------------------------------------------------------------------
-
-
-def volume_by_qhull(A: np.ndarray, b: np.ndarray, body: Polytope) -> float:
-    """Of the rows around a body, in its frame; infinite if they bound nothing."""
-    centre, axes, spread = frame(body)
-    dual = A @ (axes.T * spread) / (b - A @ centre)[:, None]
-    hull = ConvexHull(dual, qhull_options="QJ")
-    if (hull.equations[:, -1] > -1e-9).any():
-        return math.inf
-    vertices = -hull.equations[:, :-1] / hull.equations[:, -1:]
-    return ConvexHull(vertices, qhull_options="QJ").volume * float(spread.prod())
-
-
-@pytest.mark.parametrize(("p", "width"), [(3, 1.0), (3, 1e-6), (4, 1.0), (4, 1e-6)])
-def test_merging_drops_the_facet_that_keeps_out_least_and_stays_outside(p: int, width: float) -> None:
-    """One facet less, against every way to have one facet less; then a few more."""
-    rng = np.random.default_rng(p)
-    for _ in range(3):
-        body, _, _ = random_set(rng, p, rows=25, width=width)
-        (A, b), count = rows_of(body), int(body.count)
-        merged = merge_polytope(body, count - 1)
-        ways = [np.arange(count) != facet for facet in range(count)]
-        least = min(volume_by_qhull(A[way], b[way], body) for way in ways)
-        if least > 100 * body.volume().item():  # a slab that one more facet less would all but open
-            assert int(merged.count) == count
-            continue
-        assert int(merged.count) == count - 1
-        assert merged.volume().item() == pytest.approx(least, rel=1e-6)
-
-        merged = merge_polytope(body, count - 2)
-        rows, right = rows_of(merged)
-        assert len(right) <= count - 1
-        assert (points_of(body) @ rows.T <= right + 1e-14 * BOX * np.abs(rows).sum(1)).all()
-        assert (points_of(merged) @ rows.T <= right + 1e-13 * BOX * np.abs(rows).sum(1)).all()
-        assert merged.volume().item() == pytest.approx(volume_by_qhull(rows, right, body), rel=1e-6)
-        given = {
-            (*row, c): source for row, c, source in zip(A.tolist(), b.tolist(), body.source[0].tolist(), strict=True)
-        }
-        for row, c, source in zip(rows.tolist(), right.tolist(), merged.source[0].tolist(), strict=True):
-            assert given[(*row, c)] == source
-
-
-def test_merging_drops_first_what_keeps_out_least_and_never_opens_the_set() -> None:
-    block = box(3, half=1.0)
-    assert int(merge_polytope(block, 4).count) == 6
-    corners = np.array([[1.0, 1, 1], [-1.0, 1, 1], [1.0, -1, 1]])
-    chamfered = cut(block, corners, np.array([2.9, 2.5, 2.7])).body  # each cuts off a corner of edge e, e^3 / 6
-    for most, kept in [(8, {1, 2}), (7, {1}), (6, set())]:
-        merged = merge_polytope(chamfered, most)
-        assert set(merged.source[0].tolist()) == kept | {PRIOR}
-        assert merged.volume().item() == pytest.approx(8 - sum({1: 0.5**3, 2: 0.3**3}[i] / 6 for i in kept), rel=1e-12)
 
 
 def test_a_batch_is_its_items_and_padding_is_harmless() -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from torchfsid.identification.evidence import ObservationModel, evidence
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.outcome import Status
 from torchfsid.robots.barriers import Arena, Barrier, ClassK, CollisionAvoidance, SpeedPolygon
@@ -104,3 +105,72 @@ def test_drift_bounds_what_position_errors_do_to_the_nominal_control(task: Task)
     drift = task.drift(ErrorBounds(torch.full((500,), bound, dtype=torch.float64), nothing, nothing), theta.abs())
     moved = nominal(x + bound * move / move.norm(dim=-1, keepdim=True)) - nominal(x)
     assert (moved.norm(dim=-1) <= drift + 1e-12).all()
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize("velocity", ["none", "current"])
+@pytest.mark.parametrize("distance", ["squared", "euclidean"])
+def test_a_body_measured_at_the_robots_own_place(distance: str, velocity: str, compiled: bool) -> None:
+    """Positions rounded to decimetres: robot and body fall on one point. Other bodies are near, and known well."""
+    generator, goal, lattice = torch.Generator().manual_seed(6), torch.tensor([[3.0, 0.4]], dtype=torch.float64), 0.1
+    barrier = CollisionAvoidance(ClassK(1.5), safety_distance=0.03, distance=distance, neighbour_velocity=velocity)
+    prior = FeasibleSet.from_box(torch.full((1, 2), -5.0), torch.full((1, 2), 5.0))
+    noise = NoiseBound(1e-3, position=lattice * math.sqrt(0.5), neighbour_velocity=1e-3)
+    held_up = 0
+    for _ in range(40):
+        x = lattice * (torch.rand(1, 2, generator=generator, dtype=torch.float64) - 0.5)
+        ahead = 0.035 * (goal - x) / (goal - x).norm()
+        body = torch.stack([x + ahead, x + torch.tensor([0.0, 0.9])], dim=1)
+        there, standing = torch.ones(1, 2, dtype=torch.bool), torch.zeros_like(body)
+        exact = Measurement(0.0, x, None, body, there, body_velocities=standing)
+        control = CbfQpController(GoalTask(1.0), [barrier])(exact, goal)
+        held_up += int(control.active[0, 0])
+        rounded = (body / lattice).round() * lattice
+        seen = replace(exact, x=(x / lattice).round() * lattice, bodies=rounded, u=control.u)
+        watching = SetMembershipObserver(GoalTask(1.0), [barrier], prior, noise=noise, compiled=compiled)
+        estimate = watching.update(seen)
+        assert estimate.feasible_set.contains(goal).all()
+        assert estimate.status.tolist() == [Status.OK]
+        if torch.equal(rounded[:, 0], seen.x):
+            assert not estimate.informative.any()
+    assert held_up > 30
+
+
+def test_gradients_are_finite_at_a_bodys_place() -> None:
+    """Body and robot coincide for one robot of two: the other's half-spaces keep their gradients."""
+    for distance in ("squared", "euclidean"):
+        barrier = CollisionAvoidance(ClassK(1.5), safety_distance=0.3, distance=distance)
+        x = torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64, requires_grad=True)
+        bodies = torch.tensor([[[0.0, 0.0]], [[1.4, 0.0]]], dtype=torch.float64, requires_grad=True)
+        u = torch.tensor([[0.1, 0.0], [0.1, 0.2]], dtype=torch.float64)
+        prior = FeasibleSet.from_box(torch.full((2, 2), -5.0), torch.full((2, 2), 5.0))
+        model = ObservationModel(GoalTask(1.0), [barrier], noise=NoiseBound(1e-2, position=1e-2))
+        found = evidence(model, prior, Measurement(0.0, x, u, bodies, torch.ones(2, 1, dtype=torch.bool)))
+        assert found.informative.tolist() == [False, True]
+        for gradient in torch.autograd.grad(found.omega.A.sum() + found.omega.b.sum(), (x, bodies)):
+            assert bool(gradient.isfinite().all())
+            assert bool((gradient[1] != 0).any())
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_controller_that_may_have_failed_says_nothing(compiled: bool) -> None:
+    """Jammed between two bodies, a little too near to both: the QP has no solution and the robot stops. Measured, the
+    gap is wide enough, and standing still would say that the robot has arrived."""
+    barrier = CollisionAvoidance(ClassK(1.0), safety_distance=0.5)
+    goal, there = torch.tensor([[0.3, 3.0]], dtype=torch.float64), torch.ones(1, 2, dtype=torch.bool)
+    x = torch.zeros(1, 2, dtype=torch.float64)
+    jammed = torch.tensor([[[-0.48, 0.0], [0.48, 0.0]]], dtype=torch.float64)
+    control = CbfQpController(GoalTask(1.0), [barrier])(Measurement(0.0, x, None, jammed, there), goal)
+    assert not control.feasible.any()
+    prior = FeasibleSet.from_box(torch.full((1, 2), -5.0), torch.full((1, 2), 5.0))
+    for noise, error in (
+        (NoiseBound(1e-3, position=0.03), None),
+        (NoiseBound(1e-3), torch.full((1, 2), 0.03).double()),
+    ):
+        watching = SetMembershipObserver(GoalTask(1.0), [barrier], prior, noise=noise, compiled=compiled)
+        seen = Measurement(0.0, x, control.u, 1.06 * jammed, there, body_position_error=error)
+        estimate = watching.update(seen)
+        assert estimate.feasible_set.contains(goal).all()
+        assert not estimate.informative.any()
+        clear = watching.update(replace(seen, t=1.0, bodies=3 * jammed, u=x))
+        assert clear.informative.all()

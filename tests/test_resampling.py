@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.bag_writer import odometry, pose, write_bag
+from torchfsid.commands.declared_log import DeclaredLog
 from torchfsid.commands.observe import Observation
 from torchfsid.config.documents import validate
 from torchfsid.config.observe import ObserveConfig
@@ -216,7 +217,7 @@ def crossing() -> Trajectory:
 
 def sets_of(config: ObserveConfig, log: Log) -> SetMembershipObserver:
     """What remains after the whole log; no filter, no figures."""
-    observation = Observation(config, log)
+    observation = Observation(DeclaredLog(config, log))
     for measurement in observation.log.measurements(observation.robots, config.neighbour_velocities):
         observation.sets.update(measurement)
     return observation.sets

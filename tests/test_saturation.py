@@ -9,10 +9,10 @@ from torch import Tensor
 
 import torchfsid as fsid
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.identification.inverse_optimal import FAN
 from torchfsid.identification.kkt import outward_normals
 from torchfsid.identification.saturation import unclipped
 from torchfsid.robots.tasks import Saturation
+from torchfsid.tolerances import NORMALS
 
 CORNERS = torch.tensor([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]], dtype=torch.float64) / 2
 NORM, BOX = Saturation("norm", (0.5, 0.5)), Saturation("box", (0.5, 0.3))
@@ -23,7 +23,7 @@ ONLY_LAZY = Saturation("norm", (float("inf"), float("inf")), dead_speed=0.05)
 def ball(u: torch.Tensor, delta: float) -> Halfspaces:
     """uhat within delta of u, as the inverse-optimal set hands it over when no row may be active."""
     none = torch.zeros(*u.shape[:-1], 1, dtype=torch.bool)
-    normals = outward_normals(torch.ones(*u.shape[:-1], 1, 2, dtype=torch.float64), none, FAN).normals
+    normals = outward_normals(torch.ones(*u.shape[:-1], 1, 2, dtype=torch.float64), none, NORMALS).normals
     return Halfspaces(normals, (normals @ u.unsqueeze(-1)).squeeze(-1) + delta).where((normals != 0).any(-1))
 
 
@@ -49,7 +49,7 @@ def test_every_wish_is_inside(saturation: Saturation) -> None:
             u = saturation(y) - (multipliers.unsqueeze(-1) * a).sum(1)
             error = normal(B, 2)
             u = u + error / error.norm(dim=-1, keepdim=True) * delta
-            normals = outward_normals(a, may_be_active, FAN).normals
+            normals = outward_normals(a, may_be_active, NORMALS).normals
             offsets = (normals @ u.unsqueeze(-1)).squeeze(-1) + delta
             admissible = Halfspaces(normals, offsets).where((normals != 0).any(-1))
             assert (

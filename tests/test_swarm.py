@@ -11,7 +11,8 @@ import jaxtyping
 import pytest
 
 from experiments.__main__ import main
-from experiments.config import SwarmConfig, load_experiment
+from experiments.kinds import load
+from experiments.runs.config import SwarmConfig
 
 SWARM = Path(__file__).parents[1] / "configs" / "swarm.yaml"
 SMALL = ("robots=60", "side=7.5", "duration=0.9", "snapshots=[0.3, 0.9]")
@@ -83,6 +84,6 @@ def test_wrong_config_is_one_line_and_exit_code_2(
 
 
 def test_the_committed_swarm_is_a_thousand_robots_for_a_thousand_steps():
-    config = load_experiment(SWARM)
+    config = load(SWARM)
     assert isinstance(config, SwarmConfig)
     assert config.robots == config.steps == 1000

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,17 +18,22 @@ import jaxtyping
 import numpy as np
 import pytest
 from distributed import LocalCluster
+from rich.console import Console
 
 from experiments.__main__ import main
-from experiments.journal import Journal
-from experiments.sweep import sweep
-from experiments.sweep_config import load_sweep
-from experiments.sweep_summary import summarise_sweep
-from experiments.sweep_tables import read_table
-from torchfsid.errors import ConfigError
+from experiments.kinds import load
+from experiments.sweeps.config import SweepConfig
+from experiments.sweeps.journal import Journal
+from experiments.sweeps.summary import print_sweep, summarise_sweep
+from experiments.sweeps.sweep import run_sweep
+from experiments.sweeps.tables import read_table
+from experiments.sweeps.workers import WorkersError, workers
+from torchfsid.commands.results_folder import ResultsFolder
+from torchfsid.config.documents import dump
+from torchfsid.errors import ConfigError, FigureError
 
 ROOT = Path(__file__).parents[1]
-TABLES = ("runs.csv", "runs.parquet", "series.csv", "series.parquet", "config.yaml")
+TABLES = ("runs.csv", "runs.parquet", "series.csv", "series.parquet")
 RUNS = 10
 
 CONFIG = """
@@ -69,12 +76,18 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def uninterrupted(config: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("uninterrupted")
-    sweep(load_sweep(config), out, track=untracked)
+    run_sweep(load_sweep(config), out, untracked)
     return out
 
 
-def untracked(records: Iterable[Any], total: int, finished: int) -> Iterable[Any]:
+def untracked(records: Iterable[Any], *_: Any) -> Iterable[Any]:
     return records
+
+
+def load_sweep(path: Path, *overrides: str) -> SweepConfig:
+    config = load(path, overrides, "sweep")
+    assert isinstance(config, SweepConfig)
+    return config
 
 
 def assert_same_tables(out: Path, other: Path) -> None:
@@ -109,7 +122,7 @@ def test_killed_twice_and_resumed_is_the_uninterrupted_sweep(config: Path, unint
     assert 3 <= finished(tmp_path) < RUNS
     with (tmp_path / "records.jsonl").open("ab") as journal:
         journal.write(b'{"run": 9, "error": "", "row": {"rob')  # a line that a kill has cut
-    sweep(load_sweep(config), tmp_path, track=untracked)
+    run_sweep(load_sweep(config), tmp_path, untracked)
     records = (tmp_path / "records.jsonl").read_bytes().splitlines()
     assert records[:2] == first
     assert sorted(json.loads(line)["run"] for line in records) == list(range(RUNS))
@@ -119,40 +132,80 @@ def test_killed_twice_and_resumed_is_the_uninterrupted_sweep(config: Path, unint
 def test_a_dask_cluster_gives_the_same(config: Path, uninterrupted: Path, tmp_path: Path):
     # Workers in threads, reached over TCP: starting processes would take longer than the sweep.
     local = {"processes": False, "protocol": "tcp://", "dashboard_address": None}
-    with LocalCluster(n_workers=2, threads_per_worker=1, **local) as cluster:
-        sweep(load_sweep(config), tmp_path, dask=cluster.scheduler_address, track=untracked)
+    with (
+        LocalCluster(n_workers=2, threads_per_worker=1, **local) as cluster,
+        workers(dask=cluster.scheduler_address) as team,
+    ):
+        run_sweep(load_sweep(config), tmp_path, untracked, team)
     assert_same_tables(tmp_path, uninterrupted)
 
 
-def test_nothing_is_run_again_and_figures_are_drawn_from_the_tables(config: Path, uninterrupted: Path):
-    before = {path.name: path.read_bytes() for path in uninterrupted.iterdir()}
-    assert main(["sweep", str(config), "--out", str(uninterrupted)]) == 0
-    after = {path.name: path.read_bytes() for path in uninterrupted.iterdir()}
-    assert after.items() >= before.items()
-    assert after.keys() - before.keys() == {"summary.json", "figure.png", "figure.pdf"}
-    (uninterrupted / "figure.png").unlink()
-    assert main(["figures", str(uninterrupted)]) == 0
-    assert {path.name: path.read_bytes() for path in uninterrupted.iterdir()} == after
+def test_a_dask_cluster_that_dies_is_one_error(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("experiments.sweeps.workers.DASK_TIMEOUT", 0.5)
+    local = {"processes": False, "protocol": "tcp://", "dashboard_address": None}
+    cluster = LocalCluster(n_workers=1, threads_per_worker=1, **local)
+
+    def until_it_dies(records: Iterable[Any], *_: Any) -> Iterable[Any]:
+        for record in records:
+            yield record
+            cluster.close()
+
+    with pytest.raises(WorkersError, match="goes on from here"), workers(dask=cluster.scheduler_address) as team:
+        run_sweep(load_sweep(config), tmp_path, until_it_dies, team)
+    assert 1 <= finished(tmp_path) < RUNS
+    assert len(read_table(tmp_path / "runs.parquet")["run"]) == finished(tmp_path)
+
+
+def test_nothing_is_run_again_and_figures_are_drawn_from_the_tables(config: Path, uninterrupted: Path, tmp_path: Path):
+    out = tmp_path / "out"
+    out.mkdir()
+    shutil.copy(uninterrupted / "records.jsonl", out)
+    journal = (out / "records.jsonl").read_bytes()
+    assert main(["sweep", str(config), "--out", str(out)]) == 0
+    assert (out / "records.jsonl").read_bytes() == journal
+    assert_same_tables(out, uninterrupted)
+    drawn = {name: (out / name).read_bytes() for name in ("figure.png", "figure.pdf")}
+    for name in drawn:
+        (out / name).unlink()
+    assert main(["figures", str(out)]) == 0
+    assert {name: (out / name).read_bytes() for name in drawn} == drawn
 
 
 def test_other_configs_and_other_processes_are_kept_out(
-    config: Path, uninterrupted: Path, capsys: pytest.CaptureFixture[str]
+    config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    assert main(["sweep", str(config), "--out", str(uninterrupted), "--set", "seed=6"]) == 2
+    out, small = tmp_path / "out", ("--set", "repeats=1")
+    assert main(["sweep", str(config), "--out", str(out), *small]) == 0
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    capsys.readouterr()
+    assert main(["sweep", str(config), "--out", str(out), *small, "--set", "seed=6"]) == 2
     assert "holds another sweep" in capsys.readouterr().err
-    with Journal(uninterrupted / "records.jsonl"):
-        assert main(["sweep", str(config), "--out", str(uninterrupted)]) == 2
-    assert "another sweep is writing" in capsys.readouterr().err
-    assert main(["sweep", str(config), "--out", str(uninterrupted / "new"), "--dask", "nonsense://"]) == 2
+    assert main(["run", str(ROOT / "configs" / "two_pairs.yaml"), "--out", str(out)]) == 2
     assert capsys.readouterr().err.count("\n") == 1
-    assert not (uninterrupted / "new").exists()
+    folder = ResultsFolder(out, None)
+    folder.claim([], resume=True)
+    assert main(["sweep", str(config), "--out", str(out), *small]) == 2
+    assert main(["figures", str(out)]) == 2
+    folder.release()
+    assert capsys.readouterr().err.count("another command is writing there") == 2
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    assert main(["sweep", str(config), "--out", str(tmp_path / "new"), "--dask", "nonsense://"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_sweep_leaves_the_folder_of_a_run_alone(config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "config.yaml").write_text("kind: scene\n", encoding="utf-8")
+    assert main(["sweep", str(config), "--out", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
 
 
 def test_the_journal_keeps_every_whole_line(tmp_path: Path):
     path = tmp_path / "records.jsonl"
     with Journal(path) as journal:
-        journal.append({"run": 3, "row": {"a": 1}})
-        journal.append({"run": 1, "row": {"a": 2}})
+        journal.add({"run": 3, "row": {"a": 1}})
+        journal.add({"run": 1, "row": {"a": 2}})
     whole = path.read_bytes()
     for broken in (b"", b"{", b'{"run": 2, "row": {}}', b"\0\0\0"):
         path.write_bytes(whole + broken)
@@ -161,7 +214,7 @@ def test_the_journal_keeps_every_whole_line(tmp_path: Path):
             assert path.read_bytes() == whole
     path.write_bytes(b"\0\0\n" + whole)
     with Journal(path) as journal:
-        journal.append({"run": 0, "row": {}})
+        journal.add({"run": 0, "row": {}})
     with Journal(path) as journal:
         assert journal.records.keys() == {0, 1, 3}
 
@@ -187,12 +240,45 @@ def test_rows_say_what_was_run(config: Path, uninterrupted: Path):
 
 def test_a_failed_run_is_a_row_and_not_the_end(config: Path, tmp_path: Path):
     crowded = "experiment.team={robots: [1, 6], place: [disc], radius: 0.6, separation: 0.6}"
-    sweep(load_sweep(config, [crowded, "seed=2"]), tmp_path, track=untracked)
+    summary = run_sweep(load_sweep(config, crowded, "seed=2"), tmp_path, untracked)
     runs = read_table(tmp_path / "runs.parquet")
     failed = runs["error"] != ""
     assert 0 < failed.sum() < RUNS
     assert all("no room" in error for error in runs["error"][failed])
-    assert summarise_sweep(tmp_path)["failed"] == failed.sum()
+    assert summary["failed"] == failed.sum()
+
+
+def test_keys_with_dots_can_be_set(config: Path):
+    grid = "grid.measurement_noise.velocity,noise.velocity=[[0.01, 0.02]]"
+    changed = load_sweep(config, "draw.task.gain=[1, 2]", grid, "grid.task.kind=[goal]")
+    assert changed.draw == {"task.gain": (1.0, 2.0)}
+    assert changed.grid == {"measurement_noise.velocity, noise.velocity": [[0.01, 0.02]], "task.kind": ["goal"]}
+
+
+def test_an_interrupted_sweep_is_drawn_with_a_gap(config: Path, uninterrupted: Path, tmp_path: Path):
+    """Runs of the first point of the grid only."""
+    lines = (uninterrupted / "records.jsonl").read_bytes().splitlines(keepends=True)
+    (tmp_path / "records.jsonl").write_bytes(b"".join(line for line in lines if json.loads(line)["run"] < 5))
+    (tmp_path / "config.yaml").write_text(dump(load_sweep(config)), encoding="utf-8")
+    with pytest.raises(KeyboardInterrupt):
+        run_sweep(load_sweep(config), tmp_path, interrupted)
+    assert main(["figures", str(tmp_path)]) == 0
+    summary = summarise_sweep(tmp_path, load_sweep(config))
+    assert [point["runs"] for point in summary["points"]] == [5, 0]
+    print_sweep(summary, Console(file=io.StringIO()))
+
+
+def interrupted(records: Iterable[Any], *_: Any) -> Iterable[Any]:
+    raise KeyboardInterrupt
+
+
+def test_a_sweep_in_which_every_run_fails_says_so(config: Path, tmp_path: Path):
+    sweep = load_sweep(config)
+    crowded = {"robots": [9, 9], "place": ["disc"], "radius": 0.6, "separation": 0.6}
+    failing = sweep.model_copy(update={"experiment": {**sweep.experiment, "team": crowded}})
+    with pytest.raises(FigureError, match="every run failed, as with: team: no room"):
+        run_sweep(failing, tmp_path, untracked)
+    assert (tmp_path / "runs.csv").exists()
 
 
 # What it refuses ----------------------------------------------------------------------------------------------------

@@ -1,10 +1,10 @@
-"""The unscented Kalman filter on [x; theta]: against a plain Kalman filter, and whatever data may bring."""
+"""The unscented Kalman filter on [x; theta]: against a plain Kalman filter, with the QP inside, and its interface."""
 
 from __future__ import annotations
 
 import math
 import pickle
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -13,64 +13,36 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.filters import (
+    BARRIERS,
+    GOAL,
+    TASK,
+    TEAM_BARRIERS,
+    TEAM_TASK,
+    box,
+    free_run,
+    free_ukf,
+    team_run,
+    two_pairs_run,
+)
 from torchfsid.errors import InputError, SolverError
 from torchfsid.observers.ukf import FLOOR, ParameterUkf
 from torchfsid.outcome import FilterStatus
-from torchfsid.robots.barriers import ClassK, CollisionAvoidance, SpeedBox
+from torchfsid.robots.barriers import SpeedBox
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.simulation import Trajectory, simulate
 from torchfsid.robots.tasks import GoalTask, UnknownGainGoalTask, VelocityTask
 
-# Two pairs of obstacles, one pair active until 1.1 s and the other until 2.1 s, then none.
-TASK = GoalTask(1.8605)
-BARRIERS = [CollisionAvoidance(ClassK(1.1544), safety_distance=0.3688)]
-GOAL = torch.tensor([[3.5250, -0.0689]], dtype=torch.float64)
-OBSTACLES = torch.tensor([[0.9215, 0.6738], [0.9215, -0.6738], [2.5677, 1.2122], [2.5677, -1.2122]])
-# Four robots that cross each other's way.
-TEAM_TASK = GoalTask(0.8434)
-TEAM_BARRIERS = [CollisionAvoidance(ClassK(1.5704), safety_distance=0.3515)]
-TEAM_GOALS = torch.tensor([[-1.7208, 0.0952], [0.1176, -1.671], [1.6816, -0.2556], [0.0068, 1.6019]]).double()
-TEAM_STARTS = torch.tensor([[0.6138, -0.5031], [0.1617, 1.0376], [-0.9789, 0.0649], [0.3538, -1.0515]])
-
 
 @pytest.fixture(scope="module")
 def two_pairs() -> Trajectory:
-    start = torch.zeros(1, 2)
-    return simulate(CbfQpController(TASK, BARRIERS), GOAL, start, obstacles=OBSTACLES, dt=0.05, steps=52)
+    return two_pairs_run()
 
 
 @pytest.fixture(scope="module")
 def team() -> Trajectory:
-    return simulate(CbfQpController(TEAM_TASK, TEAM_BARRIERS), TEAM_GOALS, TEAM_STARTS, dt=0.05, steps=50)
-
-
-def box(robots: int, half: float = 6.0, p: int = 2) -> tuple[Tensor, Tensor]:
-    upper = torch.full((robots, p), half, dtype=torch.float64)
-    return -upper, upper
-
-
-def lost(measurement: Measurement, robots: Sequence[int]) -> Measurement:
-    """The measurement without some robots, as a log gives it: zeros, never NaN."""
-    assert measurement.u is not None
-    observed = torch.ones(len(measurement.x), dtype=torch.bool)
-    observed[list(robots)] = False
-    keep = observed.unsqueeze(-1)
-    return replace(measurement, x=measurement.x * keep, u=measurement.u * keep, observed=observed)
-
-
-def free_run(steps: int, dt: float = 0.02, goal: Tensor | None = None) -> Iterator[Measurement]:
-    """A robot with nothing in its way."""
-    goal = torch.tensor([[2.0, -1.0]], dtype=torch.float64) if goal is None else goal
-    x = torch.zeros_like(goal)
-    for k in range(steps):
-        u = goal - x
-        yield Measurement(k * dt, x, u, torch.full((1, 1, 2), 50.0).double(), torch.ones(1, 1, dtype=torch.bool))
-        x = x + dt * u
-
-
-def free_ukf(**settings: float | bool) -> ParameterUkf:
-    return ParameterUkf.from_prior(GoalTask(1.0), BARRIERS, *box(1), **settings)
+    return team_run()
 
 
 def kalman_filter(
@@ -199,127 +171,11 @@ def test_a_solver_that_fails_leaves_the_motion_unknown(monkeypatch: pytest.Monke
         raise SolverError("no solution, no certificate")
 
     with monkeypatch.context() as patch:
-        patch.setattr("torchfsid.observers.ukf.solve_safe_qp", fails)
+        patch.setattr("torchfsid.observers.motions.solve_safe_qp", fails)
         estimate = ukf.update(second)
     assert estimate.status.item() == FilterStatus.PREDICTED
     torch.testing.assert_close(estimate.theta, before.theta, atol=0, rtol=0)
     assert ukf.update(third).status.item() == FilterStatus.OK
-
-
-# What data may bring ------------------------------------------------------------------------------------------------
-
-
-def test_a_lost_measurement_says_nothing(team: Trajectory) -> None:
-    """Theta's mean stays and its covariance drifts, at the loss and at the next position, whose past is unknown."""
-    ukf = ParameterUkf.from_prior(TEAM_TASK, TEAM_BARRIERS, *box(4), process_noise=0.1)
-    for k in range(10):
-        before = ukf.update(team.measurement(k))
-    missed = ukf.update(lost(team.measurement(10), [1]))
-    again = ukf.update(team.measurement(11))
-    resumed = ukf.update(team.measurement(12))
-    assert missed.status.tolist() == again.status.tolist() == [0, FilterStatus.PREDICTED, 0, 0]
-    assert resumed.status.tolist() == [0, 0, 0, 0]
-    for steps, estimate in enumerate((missed, again), start=1):
-        torch.testing.assert_close(estimate.theta[1], before.theta[1], atol=0, rtol=0)
-        expected = before.covariance[1] + steps * 0.05 * 0.1**2 * torch.eye(2).double()
-        torch.testing.assert_close(estimate.covariance[1], expected, atol=1e-12, rtol=1e-12)
-
-
-def test_learns_between_losses() -> None:
-    ukf = free_ukf()
-    for k, measurement in enumerate(free_run(60)):
-        estimate = ukf.update(lost(measurement, [0]) if k % 3 == 0 else measurement)
-        assert estimate.status.item() == (FilterStatus.OK if k % 3 == 2 else FilterStatus.PREDICTED)
-    torch.testing.assert_close(estimate.theta, torch.tensor([[2.0, -1.0]]).double(), atol=1e-3, rtol=0)
-
-
-def test_a_robot_that_appears_late() -> None:
-    ukf = free_ukf(process_noise=0.5)
-    estimates = [ukf.update(lost(m, [0]) if k < 5 else m) for k, m in enumerate(free_run(30))]
-    statuses = [estimate.status.item() for estimate in estimates]
-    assert statuses == [FilterStatus.PREDICTED] * 6 + [FilterStatus.OK] * 24
-    torch.testing.assert_close(estimates[4].covariance[0], (12 + 0.5**2 * 0.08) * torch.eye(2).double())
-    assert (estimates[-1].theta - torch.tensor([[2.0, -1.0]])).norm() < 0.2
-
-
-def unreadable(kind: str, measurement: Measurement) -> Measurement:
-    assert measurement.u is not None
-    zero = torch.zeros_like(measurement.bodies)
-    if kind == "neighbour's velocity unknown":
-        return replace(measurement, previous_body_velocities=zero.fill_(math.nan))
-    measurement = replace(measurement, previous_body_velocities=zero)
-    near = measurement.x.unsqueeze(1) + torch.tensor([0.3, 0.0])
-    if kind == "row violated":
-        return replace(measurement, bodies=near)
-    if kind == "controller failed":
-        return replace(measurement, bodies=near, u=torch.zeros_like(measurement.u))
-    if kind == "velocity not finite":
-        return replace(measurement, u=measurement.u * math.nan)
-    return measurement
-
-
-@pytest.mark.parametrize("qp_inside", [False, True])
-@pytest.mark.parametrize(
-    "kind", ["neighbour's velocity unknown", "row violated", "controller failed", "velocity not finite"]
-)
-def test_an_unreadable_motion_says_nothing(kind: str, qp_inside: bool) -> None:
-    """The position itself counts still; it is the next one whose motion is not known."""
-    barriers = [replace(BARRIERS[0], neighbour_velocity="previous")]
-    ukf = ParameterUkf.from_prior(GoalTask(1.0), barriers, *box(1), qp_inside=qp_inside)
-    estimates = [
-        ukf.update(unreadable(kind if k == 3 else "none", measurement)) for k, measurement in enumerate(free_run(8))
-    ]
-    statuses = [estimate.status.item() for estimate in estimates]
-    assert statuses == [1, 0, 0, 0, 1, 0, 0, 0]
-    torch.testing.assert_close(estimates[4].theta, estimates[3].theta, atol=0, rtol=0)
-
-
-@pytest.mark.parametrize("broken", [-np.eye(4), np.diag([1.0, 1.0, 1.0, -1e-3]), np.ones((4, 4)), np.zeros((4, 4))])
-def test_a_covariance_that_is_not_definite_is_repaired(broken: np.ndarray) -> None:
-    ukf = free_ukf()
-    run = free_run(60)
-    for _ in range(3):
-        ukf.update(next(run))
-    kalman = ukf.filters[0]
-    assert kalman is not None
-    kalman.P = broken
-    estimate = ukf.update(next(run))
-    assert estimate.status.item() == FilterStatus.REPAIRED
-    torch.linalg.cholesky(estimate.covariance)
-    assert ukf.update(next(run)).status.item() == FilterStatus.OK
-
-
-def test_a_covariance_lost_to_round_off_is_repaired() -> None:
-    """A position noise of 1e-9 m against a prior of 1e6 m: the first update cancels all digits of the covariance."""
-    ukf = ParameterUkf(GoalTask(1.0), BARRIERS, torch.zeros(1, 2), 1e6, position_noise=1e-9, motion_noise=0.0)
-    estimates = [ukf.update(measurement) for measurement in free_run(20)]
-    assert any(estimate.status.item() == FilterStatus.REPAIRED for estimate in estimates)
-    for estimate in estimates:
-        torch.linalg.cholesky(estimate.covariance)
-    assert (estimates[-1].theta - torch.tensor([[2.0, -1.0]])).norm() < 1e-3
-
-
-@pytest.mark.parametrize("qp_inside", [False, True])
-@pytest.mark.parametrize("seed", range(4))
-def test_no_data_make_it_raise(qp_inside: bool, seed: int) -> None:
-    """Garbage in positions and velocities: the estimates stay finite and their covariances definite."""
-    rng = np.random.default_rng([seed, 7])
-    barriers = [*BARRIERS, replace(BARRIERS[0], distance="euclidean"), SpeedBox((5.0, 5.0))]
-    ukf = ParameterUkf.from_prior(TASK, barriers, *box(3), qp_inside=qp_inside, process_noise=0.0)
-    garbage = np.array([0.0, math.nan, math.inf, -math.inf, 1e300, 1e160, -1e99, 1e30, 1e-300])
-
-    def drawn(*shape: int) -> Tensor:
-        values = np.where(rng.random(shape) < 0.08, rng.choice(garbage, shape), rng.normal(size=shape))
-        return torch.from_numpy(values)
-
-    t = 0.0
-    for _ in range(40):
-        t += rng.choice([1e-9, 0.02, 3.0, 1e6])
-        present = torch.from_numpy(rng.random((3, 4)) < 0.8)
-        observed = torch.from_numpy(rng.random(3) < 0.8)
-        estimate = ukf.update(Measurement(t, drawn(3, 2), drawn(3, 2), drawn(3, 4, 2), present, observed=observed))
-        assert bool(estimate.theta.isfinite().all())
-        torch.linalg.cholesky(estimate.covariance)
 
 
 # Interface ----------------------------------------------------------------------------------------------------------

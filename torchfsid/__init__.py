@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from torchfsid.observers.ukf import ParameterUkf as ParameterUkf
     from torchfsid.programmes.layers import ChebyshevCentre as ChebyshevCentre
     from torchfsid.programmes.layers import ProjectOnto as ProjectOnto
-    from torchfsid.robots.barriers import AffineBarrier as AffineBarrier
+    from torchfsid.robots.affine_barrier import AffineBarrier as AffineBarrier
     from torchfsid.robots.barriers import Arena as Arena
     from torchfsid.robots.barriers import ClassK as ClassK
     from torchfsid.robots.barriers import CollisionAvoidance as CollisionAvoidance
@@ -51,7 +51,8 @@ _HOME = {
     "observers.set_membership": ["SetMembershipObserver"],
     "observers.ukf": ["ParameterUkf"],
     "programmes.layers": ["ChebyshevCentre", "ProjectOnto"],
-    "robots.barriers": ["AffineBarrier", "Arena", "ClassK", "CollisionAvoidance", "SpeedBox", "SpeedPolygon"],
+    "robots.affine_barrier": ["AffineBarrier"],
+    "robots.barriers": ["Arena", "ClassK", "CollisionAvoidance", "SpeedBox", "SpeedPolygon"],
     "robots.bounds": ["NoiseBound"],
     "robots.controller": ["CbfQpController"],
     "robots.measurement": ["Measurement"],

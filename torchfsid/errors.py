@@ -33,6 +33,10 @@ class SolverError(FsidError):
     """A third-party solver failed; the original exception is the cause."""
 
 
+class FigureError(FsidError):
+    """A figure could not be drawn: the file that is missing or damaged, or what the plotting library said."""
+
+
 def one_line(message: object) -> str:
     """What somebody else says, on one printable line; an exception without words is named."""
     text = " ".join(str(message).split()) or type(message).__name__

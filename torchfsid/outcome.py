@@ -40,6 +40,21 @@ class FilterStatus(IntEnum):
     """It says nothing about theta: the robot was not seen, or the motion up to it is not known (as at first sight)."""
     REPAIRED = 2
     """The covariance had lost definiteness and was repaired."""
+    FAILED = 3
+    """Its numbers overflowed, or its covariance could not be factored: time step, spread of the prior and position
+    noise are too far out of proportion (milliseconds read as seconds, say). It starts again from its prior. Remedy: the
+    units of time and length, a smaller spread, more position noise. The set does not depend on it."""
+
+
+class HybridStatus(IntEnum):
+    """How the hybrid observer brought a robot's estimate into its set."""
+
+    OK = 0
+    """Nearest point in the metric of the filter's covariance."""
+    EUCLIDEAN = 1
+    """Nearest point in the Euclidean norm: the covariance was not finite, or not positive definite."""
+    CENTROID = 2
+    """The centroid of the set: the filter's estimate was not finite, or too far away to have a nearest point."""
 
 
 class Status(IntEnum):

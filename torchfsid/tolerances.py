@@ -28,3 +28,13 @@ ANGLE_TOLERANCE = 1e-12
 
 ACTIVE_TOLERANCE = 1e-3
 """Default distance to a row's boundary below which the row counts as active [m/s]."""
+
+NORMALS = 17
+"""Outward normals of the inverse-optimal set around a full turn, both ends counted: 22.5 degrees apart, 1.3 % more
+area than the disc they replace."""
+
+CRITICAL_NORMALS = 3
+"""Outward normals of a ray in the critical region: two sides and a cap."""
+
+SPREAD = (-1.0, -1 / 3, 1 / 3, 1.0)
+"""A row of uncertain direction is a fan of generators at these fractions of its angle: dense enough for any angle."""

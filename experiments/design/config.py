@@ -5,18 +5,16 @@ Each file is complete; what is left out has the default written here. No torch i
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from experiments.config import Text, WholeNumber
+from experiments.runs.config import Text, WholeNumber
 from experiments.teams import TeamConfig
-from torchfsid.config.documents import Strict, apply_overrides, read_yaml, validate, wrong
-from torchfsid.config.observe import AvoidanceConfig, UkfConfig
+from torchfsid.config.barriers import AvoidanceConfig
+from torchfsid.config.documents import Strict, wrong
+from torchfsid.config.observers import UkfConfig
 from torchfsid.config.quantities import NonNegative, Number, PlanarVector, Positive
-from torchfsid.errors import ConfigError
 
 Count = Annotated[int, Field(strict=True, ge=1)]
 Several = Annotated[int, Field(strict=True, ge=2)]
@@ -212,18 +210,3 @@ class LearnedObserverConfig(DesignConfig):
         if any(t > self.duration for t in self.times):
             raise wrong(f"must not be after the end, {self.duration} s", "times")
         return self
-
-
-MODELS: dict[object, type[ProbePlacementConfig] | type[LearnedObserverConfig]] = {
-    "probe_placement": ProbePlacementConfig,
-    "learned_observer": LearnedObserverConfig,
-}
-
-
-def load_design(path: str | Path, overrides: Iterable[str] = ()) -> ProbePlacementConfig | LearnedObserverConfig:
-    """The design in a file, after `overrides` such as "search.steps=4". Raises `ConfigError`."""
-    mapping = apply_overrides(read_yaml(path), overrides)
-    kind = mapping.get("kind")
-    if not isinstance(kind, str) or kind not in MODELS:
-        raise ConfigError(f"{path}: kind: expected one of {', '.join(map(repr, MODELS))}, got {kind!r}")
-    return validate(mapping, MODELS[kind], source=str(path))

@@ -1,13 +1,8 @@
 """Train gains through the projection, and compare them with other observers on teams and noise they have not seen.
 
-A run leaves, beside the resolved config.yaml,
-
-    runs.csv       a row per observer, noise and team: the mean error of its robots, over time and at `times` [m]
-    curves.csv     a row per observer, noise and sample: the mean error over all robots [m]
-    training.csv   a row per trained gain and epoch: mean errors on the training and the validation teams [m]
-    answers.csv    what the trained network with pull answers: a row per noise, case and area
-    gains.json     the trained gains, whole
-    summary.json   means, and their differences to plain recursive least squares with standard errors over teams
+runs.csv has mean errors by observer, noise and team, over time and at `times`; answers.csv what the trained network
+with pull answers, by noise, case and area; summary.json differences to plain recursive least squares with standard
+errors over teams. All lengths are in metres.
 """
 
 from __future__ import annotations
@@ -20,27 +15,27 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
+from rich.console import Console
 from torch import Tensor, nn
 
 from experiments.design.adaptive import AdaptiveObserver, ConstantGain, NetworkGain, RlsGain
 from experiments.design.config import LearnedObserverConfig
-from experiments.design.recordings import Recording, record
-from experiments.design.tables import Track, write_rows
-from torchfsid.commands.results import write_json
-from torchfsid.config.documents import dump
+from experiments.design.rollouts import Rollouts, roll_out
+from experiments.kinds import Track
+from experiments.results import RowWriter, write_rows
+from experiments.tables import print_rows
+from torchfsid.commands.results_folder import write_json
 from torchfsid.identification.kkt import CASES
 
 
 def learn(config: LearnedObserverConfig, out: Path, track: Track) -> dict[str, Any]:
-    """Simulate, train, compare, and write everything but the figures; returns the summary."""
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "config.yaml").write_text(dump(config), encoding="utf-8")
+    """Simulate, train, compare; returns the summary. What an interruption finds done is in the folder."""
     levels = len(config.noise)
     train_seed, validation_seed, test_seed, start_seed = np.random.SeedSequence(config.seed).spawn(4)
     seeds = [*train_seed.spawn(levels), *validation_seed.spawn(levels)]
     counts = [config.teams.train] * levels + [config.teams.validation] * levels
     jobs = list(zip(config.noise * 2, counts, seeds, strict=True))
-    seen = [record(config, *job, filters=False) for job in track(jobs, "Simulating", len(jobs))]
+    seen = [roll_out(config, *job, filters=False) for job in track(jobs, "Simulating", len(jobs))]
     training, validation = seen[:levels], seen[levels:]
 
     tuned_pull = min(config.pulls, key=lambda a: float(_error(AdaptiveObserver(RlsGain(a)), validation)))
@@ -49,13 +44,17 @@ def learn(config: LearnedObserverConfig, out: Path, track: Track) -> dict[str, A
     prior = torch.tensor(config.prior.upper) - torch.tensor(config.prior.lower)
     sizes = config.training.hidden, float(prior.prod()), float(np.median(config.noise))
     networks = {"network": NetworkGain(*sizes, pulls=False), "network with pull": NetworkGain(*sizes, pulls=True)}
-    constant, curves = ConstantGain(tuned, config.gain), []
+    constant = ConstantGain(tuned, config.gain)
     learned = {
         "constant, learned": AdaptiveObserver(constant),
         **{name: AdaptiveObserver(network) for name, network in networks.items()},
     }
-    for name, observer in learned.items():
-        curves += train(name, observer, training, validation, config, track)
+    with RowWriter(out / "training.csv") as curves:
+        for name, observer in learned.items():
+            curves.write(train(name, observer, training, validation, config, track))
+    states = {name: {key: value.tolist() for key, value in of.state_dict().items()} for name, of in learned.items()}
+    write_json(out / "gains.json", states)
+    write_rows(out / "answers.csv", _answers(networks["network with pull"], config))
     observers = {
         "constant": _constant(config, tuned),
         **learned,
@@ -64,48 +63,49 @@ def learn(config: LearnedObserverConfig, out: Path, track: Track) -> dict[str, A
         "constant, not projected": AdaptiveObserver(ConstantGain(tuned, config.gain), projects=False),
         "RLS, not projected": AdaptiveObserver(RlsGain(), projects=False),
     }
-
-    runs: list[dict[str, Any]] = []
-    samples: list[dict[str, Any]] = []
-    jobs = list(zip(config.unseen_noise, test_seed.spawn(len(config.unseen_noise)), strict=True))
-    contains = {}
-    for noise, seed in track(jobs, "Comparing", len(jobs)):
-        recording = record(config, noise, config.teams.test, seed, filters=True)
-        contains[str(noise)] = recording.contains
-        with torch.no_grad():
-            estimates = recording.estimates | {name: of(*_inputs(recording)) for name, of in observers.items()}
-        for name, of in estimates.items():
-            error = (of - recording.goals).norm(dim=-1)
-            samples += [
-                {"observer": name, "noise": noise, "t": k * config.dt, "error": e}
-                for k, e in enumerate(error.mean(1).tolist())
-            ]
-            runs += _rows(name, noise, error, config)
-
-    write_rows(out / "runs.csv", runs)
-    write_rows(out / "curves.csv", samples)
-    write_rows(out / "training.csv", curves)
-    write_rows(out / "answers.csv", _answers(networks["network with pull"], config))
-    states = {name: {key: value.tolist() for key, value in of.state_dict().items()} for name, of in learned.items()}
-    write_json(out / "gains.json", states)
-    summary = {
+    contains, rows = _compare(config, observers, test_seed, out, track)
+    return {
         "title": config.title,
         "seed": config.seed,
         "hand-tuned gain times kp^2": tuned,
         "hand-tuned pull": tuned_pull,
         "learned gain times kp^2": float(constant.log_share.detach().exp()),
         "share of samples at which the set holds the truth": contains,
-        **summarise(runs, config),
+        **summarise(rows, config),
     }
-    write_json(out / "summary.json", summary)
-    return summary
+
+
+def _compare(
+    config: LearnedObserverConfig,
+    observers: dict[str, AdaptiveObserver],
+    seed: np.random.SeedSequence,
+    out: Path,
+    track: Track,
+) -> tuple[dict[str, float], list[dict[str, Any]]]:
+    """On teams and noise that no observer has seen; returns how often the sets held the truth, and runs.csv."""
+    jobs = list(zip(config.unseen_noise, seed.spawn(len(config.unseen_noise)), strict=True))
+    contains, rows = {}, []
+    with RowWriter(out / "runs.csv") as runs, RowWriter(out / "curves.csv") as curves:
+        for noise, child in track(jobs, "Comparing", len(jobs)):
+            seen = roll_out(config, noise, config.teams.test, child, filters=True)
+            contains[str(noise)] = seen.contains
+            with torch.no_grad():
+                estimates = seen.estimates | {name: of(*_inputs(seen)) for name, of in observers.items()}
+            for name, of in estimates.items():
+                error = (of - seen.goals).norm(dim=-1)
+                at = enumerate(error.mean(1).tolist())
+                curves.write({"observer": name, "noise": noise, "t": k * config.dt, "error": e} for k, e in at)
+                new = _rows(name, noise, error, config)
+                runs.write(new)
+                rows += new
+    return contains, rows
 
 
 def train(
     name: str,
     observer: AdaptiveObserver,
-    training: Sequence[Recording],
-    validation: Sequence[Recording],
+    training: Sequence[Rollouts],
+    validation: Sequence[Rollouts],
     config: LearnedObserverConfig,
     track: Track,
 ) -> list[dict[str, Any]]:
@@ -131,13 +131,13 @@ def _constant(config: LearnedObserverConfig, share: float) -> AdaptiveObserver:
     return AdaptiveObserver(ConstantGain(share, config.gain)).requires_grad_(False)
 
 
-def _inputs(recording: Recording) -> tuple[Any, ...]:
-    return recording.steps, recording.theta, recording.information
+def _inputs(seen: Rollouts) -> tuple[Any, ...]:
+    return seen.steps, seen.theta, seen.information
 
 
-def _error(observer: nn.Module, recordings: Sequence[Recording]) -> Float[Tensor, ""]:
+def _error(observer: nn.Module, levels: Sequence[Rollouts]) -> Float[Tensor, ""]:
     """Mean distance to the goal over robots, time and levels of noise [m]."""
-    errors = [(observer(*_inputs(recording)) - recording.goals).norm(dim=-1).mean() for recording in recordings]
+    errors = [(observer(*_inputs(seen)) - seen.goals).norm(dim=-1).mean() for seen in levels]
     return torch.stack(errors).mean()
 
 
@@ -183,3 +183,8 @@ def summarise(runs: list[dict[str, Any]], config: LearnedObserverConfig) -> dict
 
 def _paired(difference: np.ndarray) -> dict[str, float]:
     return {"minus RLS": float(difference.mean()), "standard error": float(difference.std() / len(difference) ** 0.5)}
+
+
+def print_learning(summary: dict[str, Any], console: Console) -> None:
+    for noise, observers in summary["mean errors by noise [m]"].items():
+        print_rows(console, f"Mean error in m on unseen teams, disturbance up to {noise} m/s", "observer", observers)

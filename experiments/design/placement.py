@@ -1,17 +1,7 @@
 """Place probes in many corridors by every method, and write down what came of it.
 
-A run leaves, beside the resolved config.yaml,
-
-    runs.csv             a row per corridor, number of way-points and method: the mean area over the held-out goals, the
-                         number of simulations (a placement with a goal), the seconds it took
-    placements.json      per corridor its obstacles, and the placement that each method chose
-    landscape.csv        first corridor: the mean area over the validation goals for a still probe on a grid of places
-    descent.csv          first corridor: where Adam's starts went
-    gradient_check.csv   the gradient of the mean over goals against central differences
-    no_gradient.csv      shares of placements from which there is none to follow, and of outcomes that do not count
-    switches.csv         first corridor, one goal: its area and derivative as Adam's point is moved across the corridor
-    replay.json          first corridor, one goal: what happens without a probe and with those that were chosen
-    summary.json         means over corridors, and how many times smaller they are
+runs.csv has the mean area over the held-out goals, the number of simulations (a placement with a goal) and the seconds;
+landscape.csv the mean area over the validation goals for a still probe on a grid of places.
 """
 
 from __future__ import annotations
@@ -22,37 +12,40 @@ from typing import Any
 
 import numpy as np
 import torch
+from rich.console import Console
 from torch import Tensor
 
 from experiments.design.config import ProbePlacementConfig
-from experiments.design.gradient_check import check_gradients, nothing_to_follow
 from experiments.design.probe import Probing, along
 from experiments.design.search import METHODS, Evaluated, Search, choose
-from experiments.design.switches import across, summarise_switches
-from experiments.design.tables import Track, write_rows
-from torchfsid.commands.results import write_json
-from torchfsid.config.documents import dump
+from experiments.kinds import Track
+from experiments.results import RowWriter, write_rows
+from experiments.studies.gradient_check import check_gradients, nothing_to_follow
+from experiments.studies.switches import across, summarise_switches
+from experiments.tables import print_rows
+from torchfsid.commands.results_folder import write_json
+from torchfsid.observers.set_membership import SetMembershipObserver
 
 SHOWN = ("random", "adam")
 """The methods whose choices are replayed."""
 
 
 def place(config: ProbePlacementConfig, out: Path, track: Track) -> dict[str, Any]:
-    """Search, compare, and write everything but the figures; returns the summary."""
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "config.yaml").write_text(dump(config), encoding="utf-8")
+    """Search and compare; returns the summary. What an interruption finds done is in the folder."""
     checking, *seeds, drawing = np.random.SeedSequence(config.seed).spawn(2 + config.scenes)
     corridors = [_Corridor(config, seed) for seed in seeds]
-    runs: list[dict[str, Any]] = []
+    rows: list[dict[str, Any]] = []
     jobs = [(i, K, method) for i in range(len(corridors)) for K in config.way_points for method in _methods(K)]
-    for i, K, method in track(jobs, "Searching", len(jobs)):
-        runs += [{"corridor": i, "way_points": K, **row} for row in corridors[i].compare(K, method)]
-    write_rows(out / "runs.csv", runs)
-    write_json(out / "placements.json", [corridor.record() for corridor in corridors])
+    with RowWriter(out / "runs.csv") as runs:
+        for i, K, method in track(jobs, "Searching", len(jobs)):
+            new = [{"corridor": i, "way_points": K, **row} for row in corridors[i].compare(K, method)]
+            runs.write(new)
+            write_json(out / "placements.json", [corridor.record() for corridor in corridors if corridor.chosen])
+            rows += new
 
     first = corridors[0]
-    write_rows(out / "landscape.csv", first.landscape(track))
     write_rows(out / "descent.csv", first.descent)
+    write_rows(out / "landscape.csv", first.landscape(track))
     replay = first.replay()
     write_json(out / "replay.json", replay)
     switches = across(first.probing, first.chosen[1]["adam"][0, 0], torch.tensor(replay["goal"], dtype=torch.float64))
@@ -61,10 +54,8 @@ def place(config: ProbePlacementConfig, out: Path, track: Track) -> dict[str, An
     write_rows(out / "gradient_check.csv", checks)
     nothing = nothing_to_follow(config, drawing)
     write_rows(out / "no_gradient.csv", nothing)
-    summary = {"title": config.title, "seed": config.seed, "set": config.set} | summarise(runs, checks)
-    summary |= {"no gradient": nothing, "where active sets switch": summarise_switches(switches)}
-    write_json(out / "summary.json", summary)
-    return summary
+    summary = {"title": config.title, "seed": config.seed, "set": config.set} | summarise(rows, checks)
+    return summary | {"no gradient": nothing, "where active sets switch": summarise_switches(switches)}
 
 
 def _methods(way_points: int) -> list[str]:
@@ -107,12 +98,12 @@ class _Corridor:
 
     def _judge(self, method: str, placements: Tensor | None, simulations: int, seconds: float) -> dict[str, Any]:
         with torch.no_grad():
-            outcome = self.probing.outcome(placements, self.test)
+            left = self.probing.left(placements, self.test)
         return {
             "method": method,
-            "mean_area": float(outcome.area.mean()),
-            "geometric_mean_area": float(outcome.area.log().mean().exp()),
-            "sound": float(outcome.sound.double().mean()),
+            "mean_area": float(left.area.mean()),
+            "geometric_mean_area": float(left.area.log().mean().exp()),
+            "sound": float(left.sound.double().mean()),
             "simulations": simulations,
             "seconds": seconds,
         }
@@ -136,7 +127,7 @@ class _Corridor:
         chunks = allowed.nonzero().flatten().split(self.config.search.starts)
         for items in track(chunks, "Landscape", len(chunks)):
             with torch.no_grad():
-                means[items] = self.probing.outcome(places[items].unsqueeze(1), self.validation).area.mean(-1)
+                means[items] = self.probing.left(places[items].unsqueeze(1), self.validation).area.mean(-1)
         rows = zip(places.tolist(), means.tolist(), strict=True)
         return [{"x": x, "y": y, "mean_area": "" if mean != mean else mean} for (x, y), mean in rows]
 
@@ -150,7 +141,7 @@ class _Corridor:
         """For the goal whose area with the last, most movable probe of Adam is the median one."""
         K = max(self.chosen)
         with torch.no_grad():
-            areas = self.probing.outcome(self.chosen[K]["adam"], self.test).area[0]
+            areas = self.probing.left(self.chosen[K]["adam"], self.test).area[0]
         goal = self.test[areas.argsort()[len(areas) // 2]].unsqueeze(0)
         shown = [("none", 0, None)]
         shown += [(method, K, of[method]) for K, of in self.chosen.items() for method in SHOWN]
@@ -158,10 +149,14 @@ class _Corridor:
         return {"goal": goal[0].tolist(), "obstacles": self.probing.obstacles.tolist(), "runs": runs}
 
     def _replay(self, placement: Tensor | None, goal: Tensor) -> dict[str, Any]:
-        samples = []
+        samples, model = [], self.probing.model
+        observer = SetMembershipObserver(
+            model.task, model.barriers, self.probing.prior_of(1), model.kind, model.noise, model.active_tolerance
+        )
         with torch.no_grad():
-            for k, sample in enumerate(self.probing.samples(placement, goal)):
-                theta_set, kkt = sample.estimate.feasible_set, sample.estimate.kkt
+            for k, sample in enumerate(self.probing.loop(placement, goal)):
+                estimate = observer.update(sample.measurement)
+                theta_set, kkt = estimate.feasible_set, estimate.kkt
                 share = k / max(self.config.steps - 1, 1)
                 samples.append(
                     {
@@ -219,3 +214,11 @@ def summarise(runs: list[dict[str, Any]], checks: list[dict[str, Any]]) -> dict[
         f"{row['objective']}, {row['horizon']} samples, {row['way_points']} way-points": row["cosine"] for row in checks
     }
     return {"corridors": len({row["corridor"] for row in runs}), "areas [m^2]": table, "gradient cosines": cosines}
+
+
+def print_placement(summary: dict[str, Any], console: Console) -> None:
+    for K, methods in summary["areas [m^2]"].items():
+        still = "a probe that stands still" if K == "1" else f"a path of {K} way-points"
+        print_rows(console, f"Mean area left, {still}, {summary['corridors']} corridors", "method", methods)
+    cosines = {name: {"cosine": value} for name, value in summary["gradient cosines"].items()}
+    print_rows(console, "Gradient of the mean over goals against central differences", "", cosines)

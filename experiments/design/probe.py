@@ -41,11 +41,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from experiments.design.config import BoxConfig, ProbePlacementConfig
-from experiments.design.rollout import closed_loop
-from torchfsid.observers.set_membership import SetEstimate, SetMembershipObserver
-from torchfsid.outcome import Status
+from torchfsid.halfspaces import Halfspaces
+from torchfsid.identification.evidence import ObservationModel, evidence
 from torchfsid.robots.bounds import NoiseBound
+from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.simulation import Sample, closed_loop
 from torchfsid.robots.tasks import GoalTask
 from torchfsid.sets.feasible_set import FeasibleSet
 
@@ -55,16 +56,13 @@ TOUCHING = 1e-9
 """Round-off allowed in the distance between probe and robot, and of a goal from its set [m]."""
 
 
-class Sample(NamedTuple):
-    """What is seen of a batch (placements, goals) at a time, what is left of Theta, and whether it counts."""
+class Left(NamedTuple):
+    """What is left of Theta.
 
-    measurement: Measurement
-    estimate: SetEstimate
-    sound: Bool[Tensor, "B"]
-
-
-class Outcome(NamedTuple):
-    """The area of Theta(T) [m^2], that of Theta_0 where nothing is learned; is the outcome one that counts?"""
+    Attributes:
+        area: of Theta(T) [m^2]; that of Theta_0 where nothing is learned.
+        sound: something may be learned there: it counts.
+    """
 
     area: Float[Tensor, "P S"]
     sound: Bool[Tensor, "P S"]
@@ -117,60 +115,72 @@ class Probing:
         first = torch.where(distance < Ds, self.start + Ds * (1 + TOUCHING) * outward, placements[:, 0])
         return torch.cat([first.unsqueeze(1), placements[:, 1:]], dim=1)
 
-    def samples(
+    @property
+    def controller(self) -> CbfQpController:
+        return CbfQpController(GoalTask(self.config.gain), [self.config.avoidance.build([])])
+
+    @property
+    def model(self) -> ObservationModel:
+        """What the observer is told of the robot."""
+        config, controller = self.config, self.controller
+        noise = NoiseBound(config.velocity_noise) if config.set == "inverse_optimal" else None
+        return ObservationModel(controller.task, controller.barriers, config.set, noise, config.active_tolerance)
+
+    def loop(
         self, placements: Float[Tensor, "P K 2"] | None, goals: Float[Tensor, "S 2"], steps: int | None = None
     ) -> Iterator[Sample]:
-        """Every placement with every goal, P x S items; without a placement, the goals alone."""
+        """The robot in closed loop, for every placement with every goal, P x S items; without a placement, the goals
+        alone."""
         config, S = self.config, len(goals)
         P, K = (1, 0) if placements is None else placements.shape[:2]
-        B, steps = P * S, steps or config.steps
-        standing = self.obstacles.expand(B, *self.obstacles.shape)
-        task, barriers = GoalTask(config.gain), [config.avoidance.build([])]
+        standing = self.obstacles.expand(P * S, *self.obstacles.shape)
+        duration = config.dt * max(config.steps - 1, 1)
+        present = torch.ones(P * S, len(self.obstacles) + (K > 0), dtype=torch.bool)
+
+        def around(t: float, x: Tensor, _: Tensor) -> Measurement:
+            bodies = standing
+            if placements is not None:
+                probe = along(placements, min(t / duration, 1.0))
+                bodies = torch.cat([standing, probe.repeat_interleave(S, dim=0).unsqueeze(1)], dim=1)
+            return Measurement(t=t, x=x, u=None, bodies=bodies, present=present)
+
+        theta, start = goals.repeat(P, 1), self.start.expand(P * S, 2)
+        return closed_loop(self.controller, theta, start, around, dt=config.dt, samples=steps or config.steps)
+
+    def prior_of(self, items: int) -> FeasibleSet:
+        """Theta_0 of each item."""
         lower, upper = self.prior
-        observer = SetMembershipObserver(
-            task,
-            barriers,
-            FeasibleSet.from_box(lower.expand(B, 2), upper.expand(B, 2)),
-            kind=config.set,
-            noise=NoiseBound(config.velocity_noise) if config.set == "inverse_optimal" else None,
-            active_tolerance=config.active_tolerance,
-        )
+        return FeasibleSet.from_box(lower.expand(items, 2), upper.expand(items, 2))
 
-        def bodies(k: int, _: Tensor) -> Tensor:
-            if placements is None:
-                return standing
-            probe = along(placements, k / max(config.steps - 1, 1))
-            return torch.cat([standing, probe.repeat_interleave(S, dim=0).unsqueeze(1)], dim=1)
-
-        loop = closed_loop(
-            task,
-            barriers,
-            goals.repeat(P, 1),
-            self.start.expand(B, 2),
-            bodies,
-            torch.ones(B, len(self.obstacles) + (K > 0), dtype=torch.bool),
-            dt=config.dt,
-            steps=steps,
-        )
-        sound = torch.ones(B, dtype=torch.bool)
-        for seen in loop:
-            estimate = observer.update(seen.measurement)
-            sound = sound & seen.feasible & (estimate.status == Status.OK)
-            if K > 0:
-                apart = (seen.measurement.x - seen.measurement.bodies[:, -1]).detach().norm(dim=-1)
-                sound = sound & (apart >= config.safety_distance - TOUCHING)
-            yield Sample(seen.measurement, estimate, sound)
-
-    def outcome(
+    def left(
         self, placements: Float[Tensor, "P K 2"] | None, goals: Float[Tensor, "S 2"], steps: int | None = None
-    ) -> Outcome:
-        """What every placement comes to with every goal, after all samples or the first `steps`."""
-        for sample in self.samples(placements, goals, steps):
-            last = sample
-        theta_set = last.estimate.feasible_set
-        sound = last.sound & theta_set.contains(goals.repeat(len(last.sound) // len(goals), 1), TOUCHING)
+    ) -> Left:
+        """What every placement comes to with every goal, after all samples or the first `steps`.
+
+        Theta does not change what a sample says, so all samples are read at once. Those that leave a facet in Theta(T)
+        are read once more, with gradients: the others do not change it.
+        """
+        samples = list(self.loop(placements, goals, steps))
+        T, B, model = len(samples), len(samples[0].measurement.x), self.model
+        seen, prior = Measurement.concatenate([sample.measurement for sample in samples]), self.prior_of(B)
+        all_of_them = torch.ones(T, B, dtype=torch.bool)
+        with torch.no_grad():
+            found = evidence(model, prior, seen)
+            theta_set = prior.intersect(_by_item(found.omega, all_of_them))
+        sound = torch.stack([sample.control.feasible for sample in samples]).all(0) & ~theta_set.is_empty
+        sound = sound & ~found.alarmed.reshape(T, B).any(0)
+        if placements is not None:
+            apart = (seen.x - seen.bodies[:, -1]).detach().norm(dim=-1).reshape(T, B)
+            sound = sound & (apart >= self.config.safety_distance - TOUCHING).all(0)
+        sound = sound & theta_set.contains(goals.repeat(B // len(goals), 1), TOUCHING)
+        if torch.is_grad_enabled() and placements is not None and placements.requires_grad:
+            sample = theta_set.facets().source // found.omega.rows  # negative: of the prior
+            leaves_facet = torch.zeros(T + 1, B, dtype=torch.bool).scatter(0, sample.T % (T + 1), True)[:T]
+            again = seen.select(leaves_facet.flatten())
+            told = evidence(model, self.prior_of(len(again.x)), again).omega
+            theta_set = prior.intersect(_by_item(told, leaves_facet))
         area = torch.where(sound, theta_set.volume(), self.prior_area)
-        return Outcome(area.reshape(-1, len(goals)), sound.reshape(-1, len(goals)))
+        return Left(area.reshape(-1, len(goals)), sound.reshape(-1, len(goals)))
 
 
 def along(placements: Float[Tensor, "P K 2"], fraction: float) -> Float[Tensor, "P 2"]:
@@ -193,6 +203,15 @@ def expectation(area: Float[Tensor, "P S"], objective: Objective) -> Float[Tenso
 def slope(value: Float[Tensor, ""], placements: Float[Tensor, "P K 2"]) -> Float[Tensor, "P K 2"]:
     """The gradient of a sum over placements: zero also where none of them changes anything."""
     return torch.autograd.grad(value, placements)[0] if value.requires_grad else torch.zeros_like(placements)
+
+
+def _by_item(rows: Halfspaces, used: Bool[Tensor, "T B"]) -> Halfspaces:
+    """What the `used` samples say of each item, one below the other. `rows` has these samples, in the order of time."""
+    B, item, slot = used.shape[1], used.nonzero()[:, 1], (used.long().cumsum(0) - 1)[used]
+    most = int(used.sum(0).max())
+    A, b = rows.A.new_zeros(B, most, *rows.A.shape[1:]), rows.b.new_ones(B, most, rows.rows)
+    A, b = A.index_put((item, slot), rows.A), b.index_put((item, slot), rows.b)
+    return Halfspaces(A.flatten(1, 2), b.flatten(1, 2))
 
 
 def _box(box: BoxConfig) -> tuple[Tensor, Tensor]:

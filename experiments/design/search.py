@@ -90,13 +90,13 @@ class Search:
 
     def evaluate(self, placements: Float[Tensor, "P K 2"]) -> Float[Tensor, "P S"]:
         with torch.no_grad():
-            return self.probing.outcome(placements, self.goals).area
+            return self.probing.left(placements, self.goals).area
 
 
 def predicted_path(probing: Probing, goals: Float[Tensor, "S 2"]) -> Float[Tensor, "T 2"]:
     """Where the robot goes without a probe, on average over its possible goals [m]."""
     with torch.no_grad():
-        return torch.stack([sample.measurement.x.mean(0) for sample in probing.samples(None, goals)])
+        return torch.stack([sample.measurement.x.mean(0) for sample in probing.loop(None, goals)])
 
 
 def drawn(draw: Callable[[Search, int], Tensor]) -> Callable[[Search], Evaluated]:
@@ -160,7 +160,7 @@ def _descend(
     optimiser = torch.optim.Adam([placements])
     for k in range(steps):
         optimiser.param_groups[0]["lr"] = rates[0] + (rates[1] - rates[0]) * k / steps
-        areas = search.probing.outcome(placements, search.goals).area
+        areas = search.probing.left(placements, search.goals).area
         means = found.add(placements, areas)
         better = means < lowest
         best = torch.where(better[:, None, None], placements.detach(), best)
@@ -188,5 +188,5 @@ def choose(search: Search, found: Evaluated, goals: Float[Tensor, "S 2"]) -> Flo
     finalists = torch.cat(found.means).argsort()[: search.probing.config.search.finalists]
     placements = torch.cat(found.placements)[finalists]
     with torch.no_grad():
-        best = search.probing.outcome(placements, goals).area.mean(-1).argmin()
+        best = search.probing.left(placements, goals).area.mean(-1).argmin()
     return placements[best : best + 1]

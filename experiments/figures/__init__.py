@@ -3,69 +3,44 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from experiments.config import CasesConfig, SwarmConfig
-from experiments.design.config import MODELS as DESIGNS
-from experiments.figures.animation import animate
-from experiments.figures.cases import draw_cases
-from experiments.figures.single import draw_single
+from experiments.figures.film import Film
 from experiments.figures.style import STYLE
-from experiments.figures.swarm import draw_swarm
-from experiments.figures.team import draw_comparison, draw_team
-from experiments.saved import Results
-from torchfsid.config.documents import load, read_yaml
+from experiments.kinds import KINDS
+from experiments.results import require
+from torchfsid.commands.results_folder import named
 
 
-def draw(folder: Path) -> list[Path]:
-    """Draw figure.png and figure.pdf; of a scene also animation.gif, of a team also comparison.png and comparison.pdf;
-    of a sweep with a second line in its grid, one figure per entry of that line instead.
+def draw(folder: Path, config: Any) -> list[Path]:
+    """Draw what the kind of `config` has to show, each figure as PNG and PDF, each film as GIF.
 
     Raises:
-        ConfigError: the folder has no readable config.yaml.
-        OSError: another of its files cannot be read, or a figure cannot be written.
+        FigureError: a file that is needed is missing or damaged.
+        OSError: a figure cannot be written.
     """
-    kind = read_yaml(folder / "config.yaml").get("kind")
+    require(folder, config.kind)
+    paths = []
     with mpl.rc_context(STYLE):
-        if kind == "sweep":
-            return _draw_sweep(folder)
-        if kind == "swarm":
-            config = load(folder / "config.yaml", SwarmConfig)
-            return _save(draw_swarm(folder, config), folder, "figure")
-        if kind in DESIGNS:
-            from experiments.design.figures import draw_design
-
-            return draw_design(folder, _save)
-        results = Results(folder)
-        config = results.config
-        if isinstance(config, CasesConfig):
-            return _save(draw_cases(results, config), folder, "figure")
-        if len(config.robots) == 1:
-            paths = _save(draw_single(results, config), folder, "figure")
-        else:
-            paths = _save(draw_team(results, config), folder, "figure")
-            paths += _save(draw_comparison(results, config), folder, "comparison")
-        return [*paths, animate(results, config, folder / "animation.gif")]
+        for name, drawn in KINDS[config.kind].draw(folder, config):
+            paths += _save(drawn, folder, name)
+    return paths
 
 
-def _draw_sweep(folder: Path) -> list[Path]:
-    from experiments.figures.sweep import draw_sweep
-    from experiments.swept import Swept
-
-    swept = Swept(folder)
-    if len(swept.config.axes) < 2:
-        return _save(draw_sweep(swept, None), folder, "figure")
-    figures = [(draw_sweep(swept, i), label) for i, label in enumerate(swept.labels(1))]
-    return [path for figure, label in figures for path in _save(figure, folder, f"figure_{'_'.join(label)}")]
-
-
-def _save(figure: Figure, folder: Path, name: str) -> list[Path]:
+def _save(drawn: Figure | Film, folder: Path, name: str) -> list[Path]:
+    if isinstance(drawn, Film):
+        path = folder / f"{name}.gif"
+        with named(path):
+            drawn.save(path)
+        return [path]
     paths = [folder / f"{name}.png", folder / f"{name}.pdf"]
     for path in paths:
         # No date in the PDF: the same results give the same file.
-        figure.savefig(path, metadata={"CreationDate": None} if path.suffix == ".pdf" else None)
+        with named(path):
+            drawn.savefig(path, metadata={"CreationDate": None} if path.suffix == ".pdf" else None)
         # Once is enough: the layout is the slowest part of drawing.
-        figure.set_layout_engine("none")
+        drawn.set_layout_engine("none")
     return paths

@@ -1,12 +1,11 @@
-"""The run as a GIF: the map, the whole region to its own scale, and the lengths as they fall.
+"""The run as a film: the map, the whole region to its own scale, and the lengths as they fall.
 
-The background is drawn once; a frame only adds what moves. All frames share one palette, which keeps the file small.
+The background is drawn once; a frame only adds what moves.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
@@ -14,9 +13,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from PIL import Image
 
-from experiments.config import SceneConfig
 from experiments.figures.drawing import (
     add_goal,
     add_obstacles,
@@ -28,22 +25,21 @@ from experiments.figures.drawing import (
     map_frame,
     padded,
 )
+from experiments.figures.film import Film, spread
 from experiments.figures.style import HYBRID, ROBOT, SET_COLOURS, TEAM, UKF, length
-from experiments.lengths import lengths
-from experiments.saved import Results
+from experiments.runs.config import SceneConfig
+from experiments.runs.lengths import lengths
+from experiments.runs.saved import Results
 
-FRAMES = 100
-FRAME_MS, LAST_FRAME_MS = 60, 2000
+FRAMES, FRAME_MS, COLOURS = 100, 60, 192
 SIZE, DPI = (8.0, 4.0), 100
-COLOURS = 192
-"""Of the shared palette."""
 
-Update = Callable[[int], Iterable[Artist]]
+Redraw = Callable[[int], Iterable[Artist]]
 """Brings a panel to sample k, and returns what has to be drawn."""
 
 
-def animate(results: Results, config: SceneConfig, path: Path) -> Path:
-    samples = np.unique(np.linspace(0, len(results.t) - 1, FRAMES).round().astype(int))
+def animate(results: Results, config: SceneConfig) -> Film:
+    film = Film(FRAME_MS, COLOURS)
     with mpl.rc_context({"font.size": 8, "axes.titlesize": 8.5, "axes.labelsize": 8}):
         figure = Figure(figsize=SIZE, dpi=DPI, layout="constrained")
         canvas = FigureCanvasAgg(figure)
@@ -55,28 +51,14 @@ def animate(results: Results, config: SceneConfig, path: Path) -> Path:
         ]
         canvas.draw()
         background = canvas.copy_from_bbox(figure.bbox)
-        frames = []
-        for k in samples:
+        for k in spread(len(results.t), FRAMES):
             canvas.restore_region(background)
             for panel in panels:
-                for artist in panel(int(k)):
+                for artist in panel(k):
                     assert artist.axes is not None
                     artist.axes.draw_artist(artist)
-            frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
-    _save(frames, path)
-    return path
-
-
-def _save(frames: list[Image.Image], path: Path) -> None:
-    width, height = frames[0].size
-    shown = [frames[0], frames[len(frames) // 2], frames[-1]]
-    strip = Image.new("RGB", (width, height * len(shown)))
-    for i, image in enumerate(shown):
-        strip.paste(image, (0, i * height))
-    palette = strip.quantize(COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-    first, *others = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in frames]
-    durations = [FRAME_MS] * len(others) + [LAST_FRAME_MS]
-    first.save(path, save_all=True, append_images=others, duration=durations, loop=0, optimize=True)
+            film.add(canvas)
+    return film
 
 
 def _colours(config: SceneConfig) -> list[str]:
@@ -85,7 +67,7 @@ def _colours(config: SceneConfig) -> list[str]:
     return [SET_COLOURS[config.set]] if count == 1 else [TEAM[i % len(TEAM)] for i in range(count)]
 
 
-def _map(axes: Axes, results: Results, config: SceneConfig) -> Update:
+def _map(axes: Axes, results: Results, config: SceneConfig) -> Redraw:
     alone, colours = len(config.robots) == 1, _colours(config)
     discs = add_obstacles(axes, config)
     names = list(axes.texts)
@@ -122,7 +104,7 @@ def _map(axes: Axes, results: Results, config: SceneConfig) -> Update:
     return update
 
 
-def _regions(axes: Axes, results: Results, config: SceneConfig) -> Update:
+def _regions(axes: Axes, results: Results, config: SceneConfig) -> Redraw:
     """Every region about its goal, to the scale of the largest."""
     regions = [add_region(axes, np.zeros((3, 2)), colour, filled=True) for colour in _colours(config)]
     scale = axes.text(0.99, 0.98, "", transform=axes.transAxes, ha="right", va="top")
@@ -148,7 +130,7 @@ def _regions(axes: Axes, results: Results, config: SceneConfig) -> Update:
     return update
 
 
-def _curves(axes: Axes, results: Results) -> Update:
+def _curves(axes: Axes, results: Results) -> Redraw:
     """Lengths, over a team their geometric means."""
     measures = lengths(results)
     shown = [

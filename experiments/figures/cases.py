@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,22 +12,23 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon, Rectangle
 
-from experiments.config import CasesConfig
 from experiments.figures.drawing import add_goal, add_region
 from experiments.figures.style import ACTIVE, CURVES, INVERSE_OPTIMAL, REGION, ROBOT, SET_COLOURS, UKF
-from experiments.lengths import lengths
-from experiments.saved import Region, Results
+from experiments.results import read_json, reading
+from experiments.runs.config import CasesConfig
+from experiments.runs.lengths import lengths
+from experiments.runs.saved import Region, Results
 
 SHADOW = 20.0
 """How far the forbidden side of a row is drawn, in units of the panel [m/s]."""
 
 
-def draw_cases(results: Results, config: CasesConfig) -> Figure:
+def draw_cases(folder: Path, config: CasesConfig) -> Iterator[tuple[str, Figure]]:
     """A column per case: the rows over the control half-way through, the final sets over the goal, and lengths."""
-    count = len(config.cases)
+    results, count = Results(folder, config), len(config.cases)
     figure = Figure(figsize=(1.62 * count + 0.6, 6.3), layout="constrained")
     axes = figure.subplots(3, count, height_ratios=(1, 1, 0.9))
-    half_way, measures, measured = len(results.t) // 2, lengths(results), results.summary["cases"]
+    half_way, measures, measured = len(results.t) // 2, lengths(results), _measured(results)
     reach = 1.15 * max(np.abs([*region.u, *region.nominal]).max() for region in results.regions[half_way])
     for i, case in enumerate(config.cases):
         _draw_rows(axes[0, i], results.regions[half_way][i], reach)
@@ -59,7 +62,16 @@ def draw_cases(results: Results, config: CasesConfig) -> Figure:
     labels = [*controls, "goal", "UKF", "paper's region", "inverse-optimal set"]
     lines, names = axes[2, 0].get_legend_handles_labels()
     figure.legend([*handles, *lines], [*labels, *names], loc="outside lower center", ncols=7, columnspacing=1.4)
-    return figure
+    yield "figure", figure
+
+
+def _measured(results: Results) -> list[dict[str, Any]]:
+    """What summary.json says of each case, as far as it is shown."""
+    path = results.folder / "summary.json"
+    with reading(path):
+        of_cases = read_json(path)["cases"]
+        shown = [f"{what}_{by}" for what in ("point", "region") for by in ("measured", "paper")]
+        return [{name: str(of_cases[i][name]) for name in shown} for i in range(len(results.robots))]
 
 
 def _set_verdict(axes: Axes, measured: dict[str, Any]) -> None:

@@ -12,18 +12,19 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.patches import Circle, Polygon
 
-from experiments.config import SceneConfig
 from experiments.figures.style import ACTIVE, INACTIVE
-from experiments.saved import Results
-from torchfsid.config.observe import AvoidanceConfig
+from experiments.runs.config import SceneConfig
+from experiments.runs.saved import Results
+
+SMALLEST = 1e-12
+"""Half the side of a box around a point [m]."""
 
 NO_RADIUS = 0.1
 """Radius of a disc in a scene without safety distance [m]."""
 
 
 def disc_radius(config: SceneConfig) -> float:
-    distances = [b.safety_distance for b in config.barriers if isinstance(b, AvoidanceConfig) and b.safety_distance]
-    return distances[0] / 2 if distances else NO_RADIUS
+    return NO_RADIUS if config.safety_distance is None else config.safety_distance / 2
 
 
 def map_frame(results: Results, config: SceneConfig, aspect: float) -> tuple[np.ndarray, np.ndarray]:
@@ -35,7 +36,7 @@ def map_frame(results: Results, config: SceneConfig, aspect: float) -> tuple[np.
 
 def padded(lower: np.ndarray, upper: np.ndarray, aspect: float, margin: float) -> tuple[np.ndarray, np.ndarray]:
     """The box, `margin` times as large and then widened or heightened to width / height = aspect."""
-    centre, half = (lower + upper) / 2, margin * (upper - lower) / 2
+    centre, half = (lower + upper) / 2, np.maximum(margin * (upper - lower) / 2, SMALLEST)
     half = np.array([max(half[0], half[1] * aspect), max(half[1], half[0] / aspect)])
     return centre - half, centre + half
 

@@ -11,7 +11,6 @@ from matplotlib.legend_handler import HandlerTuple
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
-from experiments.config import SceneConfig
 from experiments.figures.drawing import (
     add_goal,
     add_obstacles,
@@ -35,8 +34,9 @@ from experiments.figures.style import (
     UKF,
     length,
 )
-from experiments.lengths import lengths
-from experiments.saved import SETS, Results
+from experiments.runs.config import SceneConfig
+from experiments.runs.lengths import lengths
+from experiments.runs.saved import SETS, Results
 
 ASPECT = 1.25
 """Width / height of the maps."""

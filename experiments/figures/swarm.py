@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-import json
-from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +11,10 @@ from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from experiments.config import SwarmConfig
+from experiments.figures.drawing import NO_RADIUS
 from experiments.figures.style import INVERSE_OPTIMAL
-from torchfsid.config.observe import AvoidanceConfig
+from experiments.results import Columns, read_columns, read_json, reading
+from experiments.runs.config import SwarmConfig
 
 COLOURS = "viridis_r"
 
@@ -23,24 +22,29 @@ SMALLEST = 1e-6
 """Where the colours end [m]."""
 
 
-def draw_swarm(folder: Path, config: SwarmConfig) -> Figure:
-    sizes, robots = _columns(folder / "sizes.csv"), _columns(folder / "snapshots.csv")
-    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    times = np.unique(robots["t"])
+def draw_swarm(folder: Path, config: SwarmConfig) -> Iterator[tuple[str, Figure]]:
+    sizes = read_columns(folder / "sizes.csv").of_length(config.steps + 1)
+    snapshots = {round(t / config.dt) for t in config.snapshots}
+    robots = read_columns(folder / "snapshots.csv").of_length(config.robots * len(snapshots))
+    with reading(folder / "summary.json"):
+        lost = int(read_json(folder / "summary.json")["truth_outside"])
+    times = np.unique(robots.numbers("t"))
     figure = Figure(figsize=(3.1 * len(times) + 3.6, 3.9), layout="constrained")
     panels = figure.subplots(1, len(times) + 1, width_ratios=[3.1] * len(times) + [2.9])
-    smallest = max(float(robots["sqrt_area"].min()), SMALLEST)
-    norm = LogNorm(smallest, float(robots["sqrt_area"].max()))
+    smallest = max(float(robots.numbers("sqrt_area").min()), SMALLEST)
+    norm = LogNorm(smallest, float(robots.numbers("sqrt_area").max()))
     discs = None
     for i, (axes, t) in enumerate(zip(panels, times, strict=False)):
-        at = robots["t"] == t
-        places, goals = (np.stack([robots[f"{p}x"][at], robots[f"{p}y"][at]], axis=-1) for p in ("", "goal_"))
+        at = robots.numbers("t") == t
+        places, goals = (
+            np.stack([robots.numbers(f"{p}x")[at], robots.numbers(f"{p}y")[at]], axis=-1) for p in ("", "goal_")
+        )
         axes.add_collection(LineCollection(list(np.stack([places, goals], axis=1)), colors="0.85", lw=0.4, zorder=0))
-        width = np.full(at.sum(), _safety_distance(config))
+        width = np.full(at.sum(), config.safety_distance or NO_RADIUS)
         discs = EllipseCollection(
             width, width, np.zeros(at.sum()), units="xy", offsets=places, offset_transform=axes.transData, cmap=COLOURS
         )
-        discs.set(array=robots["sqrt_area"][at].clip(min=smallest), norm=norm, edgecolor="0.3", linewidth=0.2)
+        discs.set(array=robots.numbers("sqrt_area")[at].clip(min=smallest), norm=norm, edgecolor="0.3", linewidth=0.2)
         axes.add_collection(discs)
         half = 0.52 * config.side
         axes.set(xlim=(-half, half), ylim=(-half, half), aspect="equal", xlabel="x [m]")
@@ -50,33 +54,22 @@ def draw_swarm(folder: Path, config: SwarmConfig) -> Figure:
         figure.colorbar(discs, ax=panels[:-1], label="√area of the goal's set [m]", shrink=0.8, pad=0.01)
     _draw_sizes(panels[-1], sizes)
     figure.suptitle(
-        f"{config.title}, {config.steps} steps: truth lost for {summary['truth_outside']} of {config.robots}",
+        f"{config.title}, {config.steps} steps: truth lost for {lost} of {config.robots}",
         fontsize=9,
         x=0.01,
         ha="left",
     )
-    return figure
+    yield "figure", figure
 
 
-def _draw_sizes(axes: Axes, sizes: dict[str, np.ndarray]) -> None:
-    t = sizes["t"]
-    axes.fill_between(t, sizes["sqrt_area_0.1"], sizes["sqrt_area_0.9"], color=INVERSE_OPTIMAL, alpha=0.2, lw=0)
-    axes.semilogy(t, sizes["sqrt_area_0.5"], color=INVERSE_OPTIMAL, lw=1.8, label="median, 10 % to 90 %")
-    axes.semilogy(t, sizes["sqrt_area_1"], color=INVERSE_OPTIMAL, lw=1.0, ls=(0, (1, 1)), label="largest")
+def _draw_sizes(axes: Axes, sizes: Columns) -> None:
+    t = sizes.numbers("t")
+    axes.fill_between(
+        t, sizes.numbers("sqrt_area_0.1"), sizes.numbers("sqrt_area_0.9"), color=INVERSE_OPTIMAL, alpha=0.2, lw=0
+    )
+    axes.semilogy(t, sizes.numbers("sqrt_area_0.5"), color=INVERSE_OPTIMAL, lw=1.8, label="median, 10 % to 90 %")
+    axes.semilogy(t, sizes.numbers("sqrt_area_1"), color=INVERSE_OPTIMAL, lw=1.0, ls=(0, (1, 1)), label="largest")
     axes.set(xlabel="t [s]", ylabel="√area [m]", xlim=(t[0], t[-1]))
     axes.set_title("sizes of the sets", fontweight="bold")
     axes.grid(True)
     axes.legend(loc="lower left")
-
-
-def _columns(path: Path) -> dict[str, np.ndarray]:
-    columns: dict[str, list[str]] = defaultdict(list)
-    with path.open(newline="", encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            for name, cell in row.items():
-                columns[name].append(cell)
-    return {name: np.array(cells, dtype=str if name == "case" else float) for name, cells in columns.items()}
-
-
-def _safety_distance(config: SwarmConfig) -> float:
-    return next(b.safety_distance for b in config.barriers if isinstance(b, AvoidanceConfig) and b.safety_distance)

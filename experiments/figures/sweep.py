@@ -3,6 +3,9 @@ errors over time; in which of the paper's cases are the robots."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from pathlib import Path
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -10,9 +13,14 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from experiments.figures.style import HYBRID, INVERSE_OPTIMAL, REGION, UKF
-from experiments.swept import Swept, short
+from experiments.results import Columns
+from experiments.sweeps.config import SweepConfig
+from experiments.sweeps.swept import Swept, quantiles, short
 
 BAND = (0.1, 0.9)
+LEGEND_WIDTH = 1.6
+"""Of an entry, on average [inches]."""
+
 SIZES = (
     ("inverse_optimal_sqrt_area", "inverse-optimal set", INVERSE_OPTIMAL),
     ("critical_region_sqrt_area", "paper's region", REGION),
@@ -21,19 +29,32 @@ ERRORS = (("ukf_error", "UKF", UKF), ("hybrid_error", "hybrid", HYBRID))
 CASE_COLOURS = {"A": "#DDDDDD", "B": "#BBCCEE", "C": "#222255", "D": "#4477AA", "E": "#225522"}
 
 
-def draw_sweep(swept: Swept, second: int | None) -> Figure:
+def draw_sweep(folder: Path, config: SweepConfig) -> Iterator[tuple[str, Figure]]:
+    """One figure; over a grid with a second line, one per entry of that line."""
+    swept = Swept(folder, config)
+    if len(config.axes) < 2:
+        yield "figure", _draw(swept, None)
+    else:
+        for i, label in enumerate(swept.labels(1)):
+            yield f"figure_{'_'.join(label)}", _draw(swept, i)
+
+
+def _draw(swept: Swept, second: int | None) -> Figure:
     """`second`: entry of the grid's second line; None: there is none."""
     labels = swept.labels(0) if swept.config.axes else [[]]
     figure = Figure(figsize=(2.2 * len(labels) + 1.1, 7.4), layout="constrained")
     grid = figure.subplots(4, len(labels), sharey="row", squeeze=False, height_ratios=(2, 3.2, 3.2, 0.7))
     for column, label in enumerate(labels):
-        levels = (column, second)[: len(swept.config.axes)]
-        series, runs = swept.chosen(swept.series, levels), swept.chosen(swept.runs, levels)
-        _draw_containment(grid[0, column], series)
-        _draw_lengths(grid[1, column], series, SIZES)
-        _draw_lengths(grid[2, column], series, ERRORS)
-        _draw_cases(grid[3, column], runs)
-        grid[2, column].set_xlabel("t [s]")
+        levels = tuple(level for level in (column, second) if level is not None)[: len(swept.config.axes)]
+        runs, series = swept.chosen(swept.runs, levels), swept.chosen(swept.series, levels)
+        if len(series["run"]):
+            _draw_containment(grid[0, column], series)
+            _draw_lengths(grid[1, column], series, SIZES)
+            _draw_lengths(grid[2, column], series, ERRORS)
+            _draw_cases(grid[3, column], runs)
+            grid[2, column].set_xlabel("t [s]")
+        else:
+            _draw_nothing(grid[:, column])
         named = [f"{short(key)} {value}" for key, value in zip(swept.telling(0), label, strict=True)] if label else []
         robots = f"{len(runs['run'])} runs, {runs['robots'].sum():.0f} robots"
         grid[0, column].set_title("\n".join([*named, robots]), fontsize=8.5)
@@ -49,7 +70,7 @@ def draw_sweep(swept: Swept, second: int | None) -> Figure:
     return figure
 
 
-def _draw_containment(axes: Axes, series: dict[str, np.ndarray]) -> None:
+def _draw_containment(axes: Axes, series: Columns) -> None:
     t = np.unique(series["t"])
     for name, _, colour in SIZES:
         kind = name.removesuffix("_sqrt_area")
@@ -64,18 +85,25 @@ def _draw_containment(axes: Axes, series: dict[str, np.ndarray]) -> None:
     axes.grid(True)
 
 
-def _draw_lengths(axes: Axes, series: dict[str, np.ndarray], measures: tuple[tuple[str, str, str], ...]) -> None:
+def _draw_lengths(axes: Axes, series: Columns, measures: tuple[tuple[str, str, str], ...]) -> None:
     t = np.unique(series["t"])
     for name, _, colour in measures:
-        values = [series[name][series["t"] == at] for at in t]
-        low, middle, high = (np.array([np.nanquantile(of, q) for of in values]) for q in (BAND[0], 0.5, BAND[1]))
+        of_times = [quantiles(series[name][series["t"] == at], (BAND[0], 0.5, BAND[1])) for at in t]
+        low, middle, high = np.array(of_times).T
         axes.fill_between(t, low, high, color=colour, alpha=0.2, lw=0)
         axes.semilogy(t, middle, color=colour, lw=1.8)
     axes.set(xlim=(t[0], t[-1]))
     axes.grid(True)
 
 
-def _draw_cases(axes: Axes, runs: dict[str, np.ndarray]) -> None:
+def _draw_nothing(column: np.ndarray) -> None:
+    for axes in column:
+        axes.tick_params(bottom=False, labelbottom=False)
+    column[1].text(0.5, 0.5, "no run yet", ha="center", color="0.4", transform=column[1].transAxes)
+    column[-1].set_axis_off()
+
+
+def _draw_cases(axes: Axes, runs: Columns) -> None:
     left = 0.0
     for letter, colour in CASE_COLOURS.items():
         share = float(np.average(runs[f"case_{letter}"], weights=runs["robots"]))
@@ -96,4 +124,5 @@ def _add_legend(figure: Figure) -> None:
         (Patch(color="0.35", alpha=0.25, lw=0), "median and 10 % to 90 % of the robots"),
     ]
     handles, labels = zip(*lines, strict=True)
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(lines), columnspacing=1.5)
+    fitting = min(len(lines), max(1, int(figure.get_figwidth() / LEGEND_WIDTH)))
+    figure.legend(handles, labels, loc="outside lower center", ncols=fitting, columnspacing=1.5)

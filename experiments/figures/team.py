@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from experiments.config import SceneConfig
 from experiments.figures.drawing import (
     add_goal,
     add_obstacles,
@@ -22,8 +21,9 @@ from experiments.figures.drawing import (
     map_frame,
 )
 from experiments.figures.style import SET_NAMES, TEAM
-from experiments.lengths import lengths
-from experiments.saved import Results
+from experiments.runs.config import SceneConfig
+from experiments.runs.lengths import lengths
+from experiments.runs.saved import Results
 
 PANELS = (
     ("critical_region", "paper's region"),

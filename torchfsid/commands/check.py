@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchfsid.commands.results import constraint_name
-from torchfsid.commands.scene import AUTO_FACTOR, Scene
+from torchfsid.commands.declared_log import AUTO_FACTOR, DeclaredLog
+from torchfsid.commands.results import constraint_name, seconds
 from torchfsid.observers.consistency import Consistency
 from torchfsid.sets.feasible_set import FeasibleSet
 
@@ -31,8 +31,11 @@ class Fault:
     """Samples of a robot at odds with the declared bounds because of one row of the model.
 
     Attributes:
-        row: its label. soft: it may be violated.
-        samples: how many. first: the time of the first [s]. worst: the most that a bound is exceeded by [m/s].
+        row: its label.
+        soft: the controller may violate it.
+        samples: how many there are.
+        first: the time of the first [s].
+        worst: the most by which a bound is exceeded [m/s].
     """
 
     row: str
@@ -51,8 +54,9 @@ class RobotCheck:
 
     Attributes:
         smallest_bound: the smallest velocity bound that explains the motion.
-        median, p95, worst, worst_time: of the residuals of the samples, and when the worst was.
-        samples: that say something.
+        median, p95, worst: quantiles of the residuals of its samples.
+        worst_time: when the worst was [s].
+        samples: how many say something about theta.
         contradictions: samples that the best Theta cannot explain with the declared bound.
         violations: rows violated beyond their bound.
     """
@@ -73,10 +77,10 @@ class Check:
     """A log against its declared model.
 
     Attributes:
-        declared: the velocity bound of the configuration [m/s], or what `auto` would take; `is_auto` tells.
+        declared: the velocity bound of the configuration [m/s], or what `auto` would take.
+        is_auto: the configuration says `auto`.
         fastest: the largest speed in the log [m/s].
-        smallest_bound: the largest of the robots' smallest bounds [m/s].
-        shifts: the same if velocities are taken so many samples later; infinite: not below that of no shift.
+        shifts: `smallest_bound` if velocities are taken so many samples later; infinite: not below that of no shift.
     """
 
     robots: tuple[RobotCheck, ...]
@@ -87,10 +91,12 @@ class Check:
 
     @property
     def smallest_bound(self) -> float:
+        """The largest of the robots' smallest bounds [m/s]."""
         return max(robot.smallest_bound for robot in self.robots)
 
     @property
     def best_shift(self) -> int:
+        """How many samples later the velocities fit clearly better; 0: aligned as they are."""
         best = min(self.shifts, key=lambda shift: self.shifts[shift])
         return best if self.shifts[best] < BETTER * self.smallest_bound else 0
 
@@ -113,7 +119,7 @@ class Check:
                 first = min(faults, key=lambda fault: fault.first)
                 most = max({fault.row for fault in faults}, key=lambda row: _count(faults, row))
                 lines.append(
-                    f"{name} at {self.declared:.3g} m/s: {_count(faults)}, the first at {first.first:g} s "
+                    f"{name} at {self.declared:.3g} m/s: {_count(faults)}, the first at {seconds(first.first)} "
                     f"({first.row}), most by {most} ({_count(faults, most)})"
                 )
         return lines
@@ -167,26 +173,26 @@ class Check:
         }
 
 
-def check(scene: Scene) -> Check:
+def check(declared: DeclaredLog) -> Check:
     """Check a log against the model that is declared for it."""
-    consistency = scene.consistency()
+    consistency = declared.consistency()
     fastest = consistency.fastest
     bounds = consistency.smallest_bounds(fastest)
     enough = bounds.clamp(max=fastest)
     overall = float(enough.max())
-    declared = scene.config.noise.velocity
-    velocity = AUTO_FACTOR * overall if declared == "auto" else declared
+    bound = declared.config.noise.velocity
+    velocity = AUTO_FACTOR * overall if bound == "auto" else bound
 
     shifts = {0: float(bounds.max())}
     for shift in SHIFTS:
-        if len(scene.log.t) > abs(shift) + 1:
-            shifts[shift] = float(scene.shifted(shift).consistency().smallest_bounds(overall).max())
+        if len(declared.log.t) > abs(shift) + 1:
+            shifts[shift] = float(declared.shifted(shift).consistency().smallest_bounds(overall).max())
 
     theta, _ = consistency.sets(enough)
     residuals = consistency.residuals(theta, fastest)
-    faults = _Faults(scene.row_labels, consistency, theta, velocity, residuals)
+    faults = _Faults(declared.row_labels, consistency, theta, velocity, residuals)
     robots = []
-    for i, robot in enumerate(scene.robots):
+    for i, robot in enumerate(declared.robots):
         of_robot = residuals[:, i]
         says = ~of_robot.isnan()
         some = of_robot[says]
@@ -198,13 +204,13 @@ def check(scene: Scene) -> Check:
                 median=_quantile(some, 0.5),
                 p95=_quantile(some, 0.95),
                 worst=_quantile(some, 1.0),
-                worst_time=float(scene.log.t[k]) if len(some) else math.nan,
+                worst_time=float(declared.log.t[k]) if len(some) else math.nan,
                 samples=len(some),
                 contradictions=faults.contradictions(i),
                 violations=faults.violations(i),
             )
         )
-    return Check(tuple(robots), velocity, declared == "auto", fastest, shifts)
+    return Check(tuple(robots), velocity, bound == "auto", fastest, shifts)
 
 
 class _Faults:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
+import math
+import warnings
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,8 +17,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.font_manager import get_font_names
 from matplotlib.patches import Patch
 
+from torchfsid.commands.results_folder import write_whole
+from torchfsid.errors import FigureError, one_line
 from torchfsid.identification.kkt import CASES
 
 ROBOT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F5539", "#4D4D4D")
@@ -35,42 +41,119 @@ STYLE: dict[Any, Any] = {
 }
 
 
+MOST_POINTS = 2000
+"""Of a line or a row of cells: more than a figure is wide, drawn in the time of a few."""
+
+MOST_NAMED = 24
+"""Robots beyond which a legend names none."""
+
+WIDE_FONTS = (
+    "Noto Sans CJK JP",
+    "Noto Sans CJK SC",
+    "Noto Sans CJK KR",
+    "Noto Sans Arabic",
+    "Noto Sans Devanagari",
+    "WenQuanYi Zen Hei",
+    "Droid Sans Fallback",
+    "Hiragino Sans",
+    "Microsoft YaHei",
+    "Arial Unicode MS",
+    "Unifont",
+)
+"""Fonts for names that the default font cannot write, taken where they are installed."""
+
+
 def draw_observation(out: Path, x: np.ndarray, seen: np.ndarray, bodies: Sequence[str]) -> list[Path]:
     """Draw regions.png and regions.pdf into the results folder `out`, from its files and the log's positions.
 
     Args:
-        x: (T, N, 2) positions of the bodies [m]. seen: (T, N) where they were measured.
+        x: (T, N, 2) positions of the bodies [m].
+        seen: (T, N) where they were measured.
+
+    Raises:
+        FigureError: a file is missing or damaged, or matplotlib fails.
+        OSError: a figure cannot be written.
     """
-    final = json.loads((out / "regions.json").read_text(encoding="utf-8"))["robots"]
-    history = _history(out / "estimates.csv")
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(10.5, 5.2), layout="constrained")
-        grid = figure.add_gridspec(2, 2, width_ratios=(1.25, 1), height_ratios=(2.2, 1))
-        _draw_map(figure.add_subplot(grid[:, 0]), final, x, seen, bodies)
-        size = figure.add_subplot(grid[0, 1])
-        _draw_sizes(size, history)
-        _draw_cases(figure.add_subplot(grid[1, 1], sharex=size), history)
-        paths = [out / "regions.png", out / "regions.pdf"]
-        for path in paths:
-            figure.savefig(path)
+    final, history = _regions(out / "regions.json"), _history(out / "estimates.csv")
+    paths = [out / "regions.png", out / "regions.pdf"]
+    try:
+        with mpl.rc_context({**STYLE, "font.family": _fonts()}), warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Glyph .* missing from")  # no font has it: a box is drawn
+            figure = Figure(figsize=(10.5, 5.2), layout="constrained")
+            grid = figure.add_gridspec(2, 2, width_ratios=(1.25, 1), height_ratios=(2.2, 1))
+            _draw_map(figure.add_subplot(grid[:, 0]), final, x, seen, bodies)
+            size = figure.add_subplot(grid[0, 1])
+            _draw_sizes(size, history)
+            _draw_cases(figure.add_subplot(grid[1, 1], sharex=size), history)
+            drawn = []
+            for path in paths:
+                content = io.BytesIO()
+                figure.savefig(content, format=path.suffix[1:])
+                figure.set_layout_engine("none")  # once is enough: the layout is the slowest part of drawing
+                drawn.append(content.getvalue())
+    except Exception as error:  # of many kinds, whatever names and numbers led matplotlib to
+        raise FigureError(f"{paths[0]}: not drawn: {one_line(error)}") from error
+    for path, content in zip(paths, drawn, strict=True):
+        write_whole(path, content)
     return paths
 
 
+def _regions(path: Path) -> dict[str, Any]:
+    """The robots' final sets."""
+    try:
+        robots = json.loads(path.read_text(encoding="utf-8"))["robots"]
+        needed = ("vertices", "centroid", "diameter")
+        return {robot: {name: region[name] for name in needed} for robot, region in robots.items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise FigureError(f"{path}: missing or damaged: {one_line(error)}") from error
+
+
 def _history(path: Path) -> dict[str, dict[str, np.ndarray]]:
-    columns: dict[str, dict[str, list]] = defaultdict(lambda: defaultdict(list))
-    with path.open(newline="", encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            of_robot = columns[row["robot"]]
-            of_robot["t"].append(float(row["t"]))
-            of_robot["diameter"].append(float(row["diameter"]))
-            of_robot["case"].append(CASES.index(row["case"]) if row["case"] else np.nan)
-    return {robot: {name: np.array(values) for name, values in of.items()} for robot, of in columns.items()}
+    """Of each robot: times [s], diameters (NaN of an empty set), numbers of cases (NaN where not measured)."""
+    columns: dict[str, tuple[list[float], list[float], list[float]]] = defaultdict(lambda: ([], [], []))
+    number = {"": math.nan, **{case: float(i) for i, case in enumerate(CASES)}}
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.reader(file)
+            header = next(reader)
+            robot, *wanted = (header.index(name) for name in ("robot", "t", "diameter", "case"))
+            for row in reader:
+                t, diameter, case = (row[i] for i in wanted)
+                of_robot = columns[row[robot]]
+                of_robot[0].append(float(t))
+                of_robot[1].append(float(diameter or math.nan))
+                of_robot[2].append(number[case])
+    except (OSError, StopIteration, ValueError, LookupError, csv.Error) as error:
+        raise FigureError(f"{path}: missing or damaged: {one_line(error)}") from error
+    if not columns or len({len(t) for t, _, _ in columns.values()}) > 1:
+        raise FigureError(f"{path}: missing or damaged: the robots have not the same times, or none")
+    return {
+        robot: dict(zip(("t", "diameter", "case"), map(np.array, of_robot), strict=True))
+        for robot, of_robot in columns.items()
+    }
+
+
+def _fonts() -> list[str]:
+    there = set(get_font_names())
+    return ["sans-serif", *(font for font in WIDE_FONTS if font in there)]
+
+
+def _thinned(values: np.ndarray) -> np.ndarray:
+    """At most `MOST_POINTS` of them, evenly, the last one among them."""
+    step = -(-len(values) // MOST_POINTS)
+    return values if step <= 1 else values[(len(values) - 1) % step :: step]
+
+
+def _plain(name: str) -> str:
+    """A name as matplotlib shall write it: a dollar begins no formula, an underscore hides no line of a legend."""
+    name = name if len(name) <= 24 else f"{name[:23]}…"
+    return (" " if name.startswith("_") else "") + name.replace("$", r"\$")
 
 
 def _draw_map(axes: Axes, final: dict, x: np.ndarray, seen: np.ndarray, bodies: Sequence[str]) -> None:
     for body in bodies:
         k = bodies.index(body)
-        path = x[seen[:, k], k]
+        path = _thinned(x[seen[:, k], k])
         if len(path) == 0:  # its only sample was the last one, which has no difference to a next one
             continue
         if body not in final:
@@ -82,13 +165,13 @@ def _draw_map(axes: Axes, final: dict, x: np.ndarray, seen: np.ndarray, bodies: 
         axes.plot(*path[0], "o", color=colour, ms=4, mfc="white")
         axes.plot(*path[-1], "o", color=colour, ms=6)
     for i, (robot, region) in enumerate(final.items()):
-        if len(region["centroid"]) != 2:
+        if len(region["centroid"]) != 2 or None in region["centroid"]:  # not planar, or empty
             continue
         vertices = np.array(region["vertices"])
         axes.fill(*vertices.T, facecolor=_colour(i), edgecolor=_colour(i), alpha=0.3, lw=1.2)
         axes.plot(*region["centroid"], "+", color=_colour(i), ms=11, mew=1.6)
         axes.annotate(
-            f"{robot}: {region['diameter']:.2g} m",
+            f"{_plain(robot)}: {region['diameter']:.2g} m",
             region["centroid"],
             textcoords="offset points",
             xytext=(7, 7),
@@ -102,20 +185,24 @@ def _draw_map(axes: Axes, final: dict, x: np.ndarray, seen: np.ndarray, bodies: 
 
 def _draw_sizes(axes: Axes, history: dict[str, dict[str, np.ndarray]]) -> None:
     for i, (robot, of) in enumerate(history.items()):
-        axes.semilogy(of["t"], of["diameter"], color=_colour(i), lw=1.5, label=robot)
+        axes.plot(_thinned(of["t"]), _thinned(of["diameter"]), color=_colour(i), lw=1.5, label=_plain(robot))
+    if any((of["diameter"] > 0).any() for of in history.values()):  # not so if all sets are points
+        axes.set_yscale("log")
     axes.set(ylabel="diameter [m]", title="Size of the region")
     axes.grid(color="0.93", lw=0.6)
     axes.tick_params(labelbottom=False)
-    axes.legend(title="robot", ncols=1 + len(history) // 6, fontsize=8)
+    if len(history) <= MOST_NAMED:
+        axes.legend(title="robot", ncols=1 + len(history) // 6, fontsize=8)
 
 
 def _draw_cases(axes: Axes, history: dict[str, dict[str, np.ndarray]]) -> None:
-    cases = np.stack([of["case"] for of in history.values()])
-    t = next(iter(history.values()))["t"]
+    cases = np.stack([_thinned(of["case"]) for of in history.values()])
+    t = _thinned(next(iter(history.values()))["t"])
     ends = np.append(t, t[-1] + (t[-1] - t[-2] if len(t) > 1 else 1.0))
     colours = ListedColormap(CASE_GREYS)
     axes.pcolormesh(ends, np.arange(len(history) + 1), cases, cmap=colours, vmin=-0.5, vmax=4.5, rasterized=True)
-    axes.set_yticks(np.arange(len(history)) + 0.5, list(history))
+    named = len(history) <= MOST_NAMED
+    axes.set_yticks(np.arange(len(history)) + 0.5 if named else [], map(_plain, history) if named else [])
     axes.invert_yaxis()
     axes.set(xlabel="t [s]", ylabel="robot", title="Case")
     handles = [Patch(facecolor=grey, edgecolor="0.5", label=case) for case, grey in zip(CASES, CASE_GREYS, strict=True)]

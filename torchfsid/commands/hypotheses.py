@@ -7,15 +7,14 @@ rows that contradict each other. What is left may be true: a log can only ever t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from torchfsid.commands.declared_log import DeclaredLog, automatic_bound
 from torchfsid.commands.observe import Observation
-from torchfsid.commands.results import STATUS_NAMES, constraint_name, write_json
-from torchfsid.commands.scene import AUTO_FACTOR, Scene, automatic_bound
-from torchfsid.config.observe import ObserveConfig
-from torchfsid.logs.log import Log
+from torchfsid.commands.results import STATUS_NAMES, constraint_name
+from torchfsid.commands.results_folder import write_json
 from torchfsid.outcome import Status
 
 
@@ -47,20 +46,20 @@ class Hypotheses:
     robot, so that no hypothesis is saved by a bound of its own.
 
     Raises:
-        ConfigError: see `Scene`; or no bound up to the largest speed lets any hypothesis explain some robot.
+        ConfigError: no bound up to the largest speed lets any hypothesis explain some robot.
     """
 
-    def __init__(self, models: Mapping[str, ObserveConfig], log: Log):
+    def __init__(self, models: Mapping[str, DeclaredLog]):
         self.smallest_bounds: dict[str, float] | None = None
-        if next(iter(models.values())).noise.velocity == "auto":
+        if next(iter(models.values())).config.noise.velocity == "auto":
             best: dict[str, float] = {}
             for model in models.values():
-                for robot, bound in Scene(model, log).smallest_bounds().items():
+                for robot, bound in model.smallest_bounds().items():
                     best[robot] = min(bound, best.get(robot, math.inf))
             self.smallest_bounds = best
             bound = automatic_bound(best)
             models = {name: model.with_velocity_bound(bound) for name, model in models.items()}
-        self.observations = {name: Observation(model, log) for name, model in models.items()}
+        self.observations = {name: Observation(model) for name, model in models.items()}
 
     @property
     def samples(self) -> int:
@@ -72,34 +71,30 @@ class Hypotheses:
         """The bound in use [m/s]."""
         return next(iter(self.observations.values())).velocity_bound
 
-    def run(self, out: Path) -> Iterator[float]:
-        """Observe the log with each hypothesis into a folder of its name, yielding the time of each sample done; what
-        came of it goes to hypotheses.json."""
-        for name, observation in self.observations.items():
-            yield from observation.run(out / name)
+    def write_verdicts(self, out: Path) -> None:
+        """hypotheses.json: what became of each hypothesis for each robot."""
         verdicts = {
             robot: {name: verdict.to_json() for name, verdict in of_robot.items()}
             for robot, of_robot in self.verdicts().items()
         }
         write_json(out / "hypotheses.json", verdicts)
-        if self.smallest_bounds is not None:
-            found = {"smallest": self.smallest_bounds, "factor": AUTO_FACTOR, "used": self.velocity_bound}
-            write_json(out / "velocity_bound.json", found)
 
     def verdicts(self) -> dict[str, dict[str, HypothesisVerdict]]:
         """For each robot, what became of each hypothesis. (The leader of a formation keeps no offset to itself.)"""
         verdicts: dict[str, dict[str, HypothesisVerdict]] = {}
         for name, observation in self.observations.items():
-            labels, volumes = observation.scene.row_labels, observation.sets.feasible_set.volume().tolist()
+            labels, volumes = observation.declared.row_labels, observation.sets.feasible_set.volume().tolist()
             for i, robot in enumerate(observation.robots):
                 events = [e for e in observation.sets.events if e.robot == i and e.status == Status.INCONSISTENT]
                 rows = events[0].rows if events else ()
                 verdicts.setdefault(robot, {})[name] = HypothesisVerdict(
                     status=STATUS_NAMES[Status(int(observation.sets.status[i]))],
-                    refuted_at=events[0].t if events else None,
-                    evidence=tuple(
-                        (None if math.isnan(time) else time, constraint_name(source, labels)) for time, source in rows
-                    ),
+                    refuted_at=float(events[0].t) if events else None,
+                    evidence=tuple((_or_none(float(time)), constraint_name(source, labels)) for time, source in rows),
                     volume=volumes[i],
                 )
         return verdicts
+
+
+def _or_none(time: float) -> float | None:
+    return None if math.isnan(time) else time

@@ -2,31 +2,37 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
 
-from torchfsid.commands.figures import draw_observation
-from torchfsid.commands.results import STATUS_NAMES, ResultsWriter, write_json
-from torchfsid.commands.scene import AUTO_FACTOR, Scene, automatic_bound
-from torchfsid.config.documents import dump
+from torchfsid.commands.declared_log import AUTO_FACTOR, DeclaredLog, automatic_bound
+from torchfsid.commands.results import STATUS_NAMES, ResultsWriter, of_sets
 from torchfsid.config.observe import ObserveConfig
 from torchfsid.identification.kkt import CASES
 from torchfsid.logs.log import Log
 from torchfsid.observers.hybrid import HybridObserver
 from torchfsid.observers.set_membership import SetMembershipObserver
-from torchfsid.observers.ukf import ParameterUkf
 from torchfsid.outcome import Status
+from torchfsid.robots.measurement import Measurement
+
+Track = Callable[[Iterable[Measurement]], Iterable[Measurement]]
+"""Passes measurements on, and shows how far they have come."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a log says about one robot: `cases` counts the samples of each case; `no_information_since` is the time at
-    which the set last shrank [s], None if it never did; `resets` are the times of changes of its mind [s]."""
+    """What a log says about one robot. Of an empty set, sizes and centres are NaN as `FeasibleSet` has them.
+
+    Attributes:
+        cases: how many samples of each case were used.
+        skipped: how many samples were not.
+        no_information_since: when the set last shrank [s]; None: never.
+        resets: when the robot changed its mind [s].
+    """
 
     robot: str
     cases: dict[str, int]
@@ -46,53 +52,41 @@ class Observation:
     """A log and the declared model, ready to run.
 
     Attributes:
-        config: with the velocity bound that was found, if it said `auto`.
+        declared: the two; with the velocity bound that was found, if the configuration said `auto`.
+        observer: the sets alone, or with the filter, if the configuration wants one.
         smallest_bounds: for each robot the smallest velocity bound that explains its motion [m/s], if it said `auto`.
 
     Raises:
-        ConfigError: see `Scene` and `automatic_bound`.
+        ConfigError: see `automatic_bound`.
     """
 
-    config: ObserveConfig
-    log: Log
-    scene: Scene = field(init=False)
-    robots: list[str] = field(init=False)
+    declared: DeclaredLog
     sets: SetMembershipObserver = field(init=False)
-    hybrid: HybridObserver = field(init=False)
+    observer: SetMembershipObserver | HybridObserver = field(init=False)
     smallest_bounds: dict[str, float] | None = field(init=False, default=None)
     _cases: dict[str, Counter[str]] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.scene = scene = Scene(self.config, self.log)
         if self.config.noise.velocity == "auto":
-            self.smallest_bounds = scene.smallest_bounds()
-            self.config = self.config.with_velocity_bound(automatic_bound(self.smallest_bounds))
-        config, self.log, self.robots = self.config, scene.log, scene.robots
+            self.smallest_bounds = self.declared.smallest_bounds()
+            self.declared = self.declared.with_velocity_bound(automatic_bound(self.smallest_bounds))
         self._cases = {robot: Counter() for robot in self.robots}
-        self.sets = SetMembershipObserver(
-            scene.task,
-            scene.barriers,
-            scene.prior,
-            kind=config.set,
-            noise=config.noise.build(),
-            active_tolerance=config.active_tolerance,
-            on_inconsistent=config.on_inconsistent,
-        )
-        lower, upper = (
-            torch.tensor(bound, dtype=torch.float64).expand(len(self.robots), -1)
-            for bound in (config.prior.lower, config.prior.upper)
-        )
-        ukf = ParameterUkf(
-            scene.task,
-            scene.barriers,
-            mean=(lower + upper) / 2,
-            spread=(upper - lower) / math.sqrt(12) if config.ukf.prior_std is None else config.ukf.prior_std,
-            position_noise=config.ukf.position_noise,
-            process_noise=config.ukf.process_noise,
-            active_tolerance=config.active_tolerance,
-            qp_inside=config.ukf.qp_inside,
-        )
-        self.hybrid = HybridObserver(self.sets, ukf, feedback=config.ukf.feedback)
+        self.observer = self.config.build_observer(self.declared.task, self.declared.barriers, len(self.robots))
+        self.sets = self.observer.sets if isinstance(self.observer, HybridObserver) else self.observer
+
+    @property
+    def config(self) -> ObserveConfig:
+        return self.declared.config
+
+    @property
+    def log(self) -> Log:
+        """As it is observed: see `DeclaredLog`."""
+        return self.declared.log
+
+    @property
+    def robots(self) -> list[str]:
+        """The bodies to infer."""
+        return self.declared.robots
 
     @property
     def samples(self) -> int:
@@ -117,27 +111,25 @@ class Observation:
         if sets.prior.dim != 2:
             return []
         half = torch.full((len(self.robots),), self.velocity_bound / AUTO_FACTOR, dtype=torch.float64)
-        _, suffices = self.scene.consistency().sets(half)
+        _, suffices = self.declared.consistency().sets(half)
         needs_more = (sets.status == Status.OK) & ~suffices
         return [robot for robot, strained in zip(self.robots, needs_more.tolist(), strict=True) if strained]
 
-    def run(self, out: Path) -> Iterator[float]:
-        """Observe the whole log into the folder `out`, yielding the time of each sample done; the figure comes last."""
+    def run(self, out: Path, track: Track = iter) -> None:
+        """Observe the whole log; estimates.csv and regions.json go to the folder `out`, which is there.
+
+        Raises:
+            OSError: a file could not be written. The log was observed to its end all the same.
+        """
         with ResultsWriter(out, self.robots, self.sets) as results:
-            (out / "config.yaml").write_text(dump(self.config), encoding="utf-8")
-            if self.smallest_bounds is not None:
-                found = {"smallest": self.smallest_bounds, "factor": AUTO_FACTOR, "used": self.velocity_bound}
-                write_json(out / "velocity_bound.json", found)
-            for measurement in self.scene.measurements():
-                estimate = self.hybrid.update(measurement)
+            for measurement in track(self.declared.measurements()):
+                estimate = self.observer.update(measurement)
                 results.write(measurement, estimate)
-                informative = estimate.set_estimate.informative.tolist()
+                sets = of_sets(estimate)
                 for robot, case, used in zip(
-                    self.robots, estimate.set_estimate.kkt.case.tolist(), informative, strict=True
+                    self.robots, sets.kkt.case.tolist(), sets.informative.tolist(), strict=True
                 ):
                     self._cases[robot].update([CASES[case]] if used else [])
-                yield measurement.t
-        draw_observation(out, self.log.x, self.log.seen, self.log.bodies)
 
     def verdicts(self) -> list[Verdict]:
         """A line per robot, as things stand."""
@@ -155,7 +147,7 @@ class Observation:
                 centre=tuple(centre[i].tolist()),
                 radius=float(radius[i]),
                 no_information_since=None if sets.last_cut[i].isnan() else float(sets.last_cut[i]),
-                resets=tuple(event.t for event in self.sets.events if event.robot == i and event.reset),
+                resets=tuple(float(event.t) for event in self.sets.events if event.robot == i and event.reset),
                 status=STATUS_NAMES[Status(int(self.sets.status[i]))],
             )
             for i, robot in enumerate(self.robots)

@@ -1,26 +1,28 @@
 """The results folder: what a run leaves behind, in the files of the contract.
 
-    estimates.csv   a row per robot and time, flushed as the run goes on: a crash loses nothing that was written
+    config.yaml     the resolved configuration, from which the run can be repeated (`results_folder`)
+    estimates.csv   a row per robot and time, whole samples only, whatever ends the run
     regions.json    the final set of every robot, rows A theta <= b
-    config.yaml     the resolved configuration, from which the run can be repeated
 
 Columns of estimates.csv: t, robot, case, n_active, then of the set volume, diameter, centre_i (Chebyshev), radius,
 centroid_i, then ukf_i, hybrid_i, status. Further sets follow with their name as prefix. `case` and `n_active` are empty
-where the robot was not measured.
+where the robot was not measured, ukf_i and hybrid_i without a filter, sizes and centres of an empty set.
 """
 
 from __future__ import annotations
 
 import csv
-import json
+import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 
 import torch
 from torch import Tensor
 
+from torchfsid.commands.interruption import uninterrupted
+from torchfsid.commands.results_folder import named, write_json
 from torchfsid.identification.kkt import CASES
 from torchfsid.observers.hybrid import HybridEstimate
 from torchfsid.observers.set_membership import SetEstimate, SetMembershipObserver
@@ -32,8 +34,10 @@ STATUS_NAMES = {Status.OK: "ok", Status.ALARM: "alarm", Status.INCONSISTENT: "in
 
 
 class ResultsWriter:
-    """Writes a results folder while a run goes on. Use it as a context manager: `regions.json` is written on leaving,
-    also when the run broke off.
+    """Writes estimates.csv while a run goes on, and regions.json on leaving, also when the run broke off.
+
+    Use it as a context manager. A file that cannot be written, as on a full disk, does not end the run: estimates.csv
+    stops after its last whole sample, and the error is raised on leaving.
 
     Args:
         out: the folder; made if it is not there.
@@ -47,52 +51,79 @@ class ResultsWriter:
         out: Path,
         robots: Sequence[str],
         observer: SetMembershipObserver,
-        others: dict[str, SetMembershipObserver] | None = None,
+        others: Mapping[str, SetMembershipObserver] = MappingProxyType({}),
     ):
-        self.out, self.robots, self.observer, self.others = out, list(robots), observer, others or {}
+        self.out, self.robots, self.observer, self.others = out, list(robots), observer, others
+        self._described = {name: _Descriptions() for name in ("", *others)}
+        self._problem: OSError | None = None
 
     def __enter__(self) -> ResultsWriter:
         self.out.mkdir(parents=True, exist_ok=True)
         p = self.observer.feasible_set.dim
-        header = [
-            "t",
-            "robot",
-            "case",
-            "n_active",
-            *set_columns(p),
-            *_indexed("ukf", p),
-            *_indexed("hybrid", p),
-            "status",
-        ]
+        header = ["t", "robot", "case", "n_active", *set_columns(p), *_indexed("ukf", p), *_indexed("hybrid", p)]
+        header.append("status")
         for prefix in self.others:
             header += [f"{prefix}_{name}" for name in (*set_columns(p), "status")]
-        self._file = (self.out / "estimates.csv").open("w", newline="", encoding="utf-8")
-        self._csv = csv.writer(self._file)
-        self._csv.writerow(header)
+        self._file = (self.out / "estimates.csv").open("wb", buffering=0)
+        self._write_rows([header])
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self._file.close()
-        write_json(self.out / "regions.json", regions(self.robots, self.observer))
+        with uninterrupted():
+            self._file.close()
+            try:
+                write_json(self.out / "regions.json", regions(self.robots, self.observer))
+            except OSError as problem:
+                self._problem = self._problem or problem
+        if self._problem is not None:
+            raise self._problem
 
     def write(
-        self, measurement: Measurement, estimate: HybridEstimate, others: dict[str, SetEstimate] | None = None
+        self,
+        measurement: Measurement,
+        estimate: HybridEstimate | SetEstimate,
+        others: Mapping[str, SetEstimate] = MappingProxyType({}),
     ) -> None:
         """One row per robot for the instant of `estimate`."""
-        sets = estimate.set_estimate
-        measured = (
-            torch.ones(len(self.robots), dtype=torch.bool) if measurement.observed is None else measurement.observed
-        )
-        described, status = describe(sets.feasible_set), sets.status.tolist()
-        extra = [(describe(other.feasible_set), other.status.tolist()) for other in (others or {}).values()]
+        if self._problem is not None:
+            return
+        sets, blank = of_sets(estimate), [[""] * self.observer.feasible_set.dim] * len(self.robots)
+        ukf, hybrid = blank, blank
+        if isinstance(estimate, HybridEstimate):
+            ukf, hybrid = _texts(estimate.ukf_estimate.theta), _texts(estimate.theta)
+        observed = measurement.observed
+        measured = [True] * len(self.robots) if observed is None else observed.tolist()
+        case, n_active, status = sets.kkt.case.tolist(), sets.kkt.n_active.tolist(), sets.status.tolist()
+        described, t = self._described[""](sets.feasible_set), _number(float(estimate.t))
+        extra = [(self._described[name](other.feasible_set), other.status.tolist()) for name, other in others.items()]
+        rows = []
         for i, robot in enumerate(self.robots):
-            active = [CASES[int(sets.kkt.case[i])], int(sets.kkt.n_active[i])] if measured[i] else ["", ""]
-            row = [_number(estimate.t), robot, *active, *described[i], *_numbers(estimate.ukf_estimate.theta[i])]
-            row += [*_numbers(estimate.theta[i]), STATUS_NAMES[status[i]]]
+            active = [CASES[case[i]], str(n_active[i])] if measured[i] else ["", ""]
+            row = [t, robot, *active, *described[i], *ukf[i], *hybrid[i], STATUS_NAMES[status[i]]]
             for columns, other_status in extra:
                 row += [*columns[i], STATUS_NAMES[other_status[i]]]
-            self._csv.writerow(row)
-        self._file.flush()
+            rows.append(row)
+        self._write_rows(rows)
+
+    def _write_rows(self, rows: Sequence[Sequence[str]]) -> None:
+        """All of them or none, whatever happens meanwhile."""
+        text = io.StringIO(newline="")
+        csv.writer(text).writerows(rows)
+        content, whole = text.getvalue().encode(), self._file.tell()
+        try:
+            with named(self.out / "estimates.csv"):
+                while content:
+                    content = content[self._file.write(content) :]
+        except BaseException as error:
+            self._file.truncate(whole)
+            if not isinstance(error, OSError):
+                raise
+            self._problem = error
+
+
+def of_sets(estimate: HybridEstimate | SetEstimate) -> SetEstimate:
+    """What the sets say by themselves."""
+    return estimate.set_estimate if isinstance(estimate, HybridEstimate) else estimate
 
 
 def set_columns(p: int) -> list[str]:
@@ -101,10 +132,33 @@ def set_columns(p: int) -> list[str]:
 
 
 def describe(sets: FeasibleSet) -> list[list[str]]:
-    """Volume, diameter, Chebyshev centre and radius, centroid of each set, as text."""
+    """Volume, diameter, Chebyshev centre and radius, centroid of each set, as text; nothing where there is none."""
     centre, radius = sets.chebyshev()
     columns = [sets.volume()[:, None], sets.diameter()[:, None], centre, radius[:, None], sets.centroid()]
-    return [_numbers(row) for row in torch.cat(columns, dim=-1)]
+    return _texts(torch.cat(columns, dim=-1))
+
+
+class _Descriptions:
+    """`describe` sample after sample: only the sets that have changed are measured again."""
+
+    def __init__(self) -> None:
+        self._texts: list[list[str]] = []
+        self._last_cut = torch.empty(0)
+
+    def __call__(self, sets: FeasibleSet) -> list[list[str]]:
+        last_cut = sets.last_cut.nan_to_num(nan=-math.inf)  # a set that starts again is the prior: never cut
+        if not self._texts:
+            self._texts = describe(sets)
+        elif len(changed := (last_cut != self._last_cut).nonzero().flatten()):
+            for i, texts in zip(changed.tolist(), describe(sets.select(changed)), strict=True):
+                self._texts[i] = texts
+        self._last_cut = last_cut
+        return self._texts
+
+
+def seconds(t: float) -> str:
+    """A time as text, to a tenth of a millisecond, also where it is counted from 1970."""
+    return f"{round(t, 4):.15g} s"
 
 
 def constraint_name(source: int, labels: Sequence[str]) -> str:
@@ -115,10 +169,10 @@ def constraint_name(source: int, labels: Sequence[str]) -> str:
 
 
 def regions(robots: Sequence[str], observer: SetMembershipObserver) -> dict:
-    """The final sets, as regions.json holds them.
+    """The final sets, as regions.json holds them; what is NaN here is null there.
 
-    `last_cut` is null where the set never shrank; `facets` tells when and from which constraint each row came (`source`
-    as in `critical_region` and `inverse_optimal_set`; -1: the prior).
+    `last_cut` is NaN where the set never shrank, and sizes and centres are where it is empty. `facets` tells when and
+    from which constraint each row came (`source` as in `critical_region` and `inverse_optimal_set`; -1: the prior).
     """
     sets = observer.feasible_set
     facets, (centre, radius) = sets.facets(), sets.chebyshev()
@@ -138,30 +192,23 @@ def regions(robots: Sequence[str], observer: SetMembershipObserver) -> dict:
             "chebyshev_centre": centre[i].tolist(),
             "chebyshev_radius": float(radius[i]),
             "status": STATUS_NAMES[Status(int(observer.status[i]))],
-            "last_cut": _or_none(float(sets.last_cut[i])),
+            "last_cut": float(sets.last_cut[i]),
             "skipped": int(observer.skipped[i]),
             "facets": [
-                {"time": _or_none(time), "source": source}
+                {"time": time, "source": source}
                 for time, source in zip(facets.time[i][real].tolist(), facets.source[i][real].tolist(), strict=True)
             ],
             "events": [
                 {
-                    "t": event.t,
+                    "t": float(event.t),
                     "status": STATUS_NAMES[event.status],
                     "reset": event.reset,
-                    "rows": [{"time": _or_none(time), "source": source} for time, source in event.rows],
+                    "rows": [{"time": float(time), "source": source} for time, source in event.rows],
                 }
                 for event in events
             ],
         }
     return {"robots": of_robots}
-
-
-def write_json(path: Path, content: object) -> None:
-    """Write a file whole or not at all."""
-    partial = path.with_suffix(path.suffix + ".partial")
-    partial.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    partial.replace(path)
 
 
 def _without_repeats(vertices: Tensor) -> Tensor:
@@ -176,12 +223,9 @@ def _indexed(name: str, p: int) -> list[str]:
 
 
 def _number(value: float) -> str:
-    return f"{value:.12g}"
+    """All digits that mean something; in the coordinates of a country, twelve of them would be hundredths of a mm."""
+    return f"{value:.15g}" if math.isfinite(value) else ""
 
 
-def _numbers(values: Tensor) -> list[str]:
-    return [_number(value) for value in values.tolist()]
-
-
-def _or_none(value: float) -> float | None:
-    return None if math.isnan(value) else value
+def _texts(values: Tensor) -> list[list[str]]:
+    return [[_number(value) for value in row] for row in values.tolist()]

@@ -42,6 +42,9 @@ class Strict(BaseModel):
 
 Config = TypeVar("Config", bound=Strict)
 
+CHOICES = frozenset({"<section>", "<false>"})
+"""Tags of `Section | Literal[False]`. Pydantic puts them into paths, but they are no keys."""
+
 
 def load(path: str | Path, model: type[Config], overrides: Iterable[str] = ()) -> Config:
     """The file at `path`, after `overrides` such as "noise.velocity=0.02", as a `model`.
@@ -54,8 +57,12 @@ def load(path: str | Path, model: type[Config], overrides: Iterable[str] = ()) -
 
 def dump(config: Strict) -> str:
     """The configuration with its defaults filled in, as YAML that loads back to the same configuration."""
-    content = config.model_dump(mode="json", exclude_none=True)
-    return yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
+    return to_yaml(config.model_dump(mode="json", exclude_none=True))
+
+
+def to_yaml(content: Mapping[str, Any]) -> str:
+    """Keys and values as YAML, in their order."""
+    return yaml.safe_dump(dict(content), sort_keys=False, default_flow_style=None)
 
 
 def read_yaml(path: str | Path) -> dict[Any, Any]:
@@ -113,12 +120,12 @@ def validate(mapping: Mapping[Any, Any], model: type[Config], source: str) -> Co
 
 
 def _path(error: ErrorDetails, mapping: Mapping[Any, Any]) -> str:
-    """`barriers[0].safety_distance`. Pydantic also names the kind of a section on the way, which is no key."""
+    """`barriers[0].safety_distance`. Pydantic also names kinds and tags of sections, which are no keys."""
     keys: list[Any] = []
     node: Any = mapping
     kind = None
     for part in error["loc"]:
-        if kind is not None and part == kind:
+        if (kind is not None and part == kind) or part in CHOICES:
             kind = None
             continue
         keys.append(part)
@@ -161,7 +168,7 @@ def _sentence(error: ErrorDetails) -> str:
 
 class _Loader(yaml.SafeLoader):
     """YAML as `safe_load` reads it, except that a key may not be given twice, and that only plain decimal notation
-    makes a whole number: the body called 010 is not number 8."""
+    makes a number: the body called 010 is not number 8, and neither 1_0 nor 1_0.0 is ten."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
         seen = set()
@@ -175,8 +182,13 @@ class _Loader(yaml.SafeLoader):
         text = self.construct_scalar(node)
         return int(text) if re.fullmatch(r"0|-?[1-9][0-9]*", text) else text
 
+    def construct_fraction(self, node: yaml.ScalarNode) -> float | str:
+        text = self.construct_scalar(node)
+        return text if "_" in text or ":" in text else self.construct_yaml_float(node)
+
 
 _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_decimal)
+_Loader.add_constructor("tag:yaml.org,2002:float", _Loader.construct_fraction)
 
 
 def _parse(text: str | bytes, source: str) -> Any:

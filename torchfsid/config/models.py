@@ -11,13 +11,13 @@ else in the file holds for all of them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
-from torchfsid.config.documents import Strict, apply_overrides, read_yaml, validate, wrong
+from torchfsid.config.documents import Strict, apply_overrides, dump, read_yaml, to_yaml, validate, wrong
 from torchfsid.config.observe import ObserveConfig, PriorConfig
 from torchfsid.config.tasks import TaskConfig
 from torchfsid.errors import ConfigError
@@ -68,3 +68,16 @@ def load_models(path: str | Path, overrides: Iterable[str] = ()) -> dict[str, Ob
         own = {key: raw[key] for key in ("task", "prior") if key in raw}
         models[hypothesis.called] = validate({**common, **own}, ObserveConfig, f"{source} ({hypothesis.called})")
     return models
+
+
+def dump_models(models: Mapping[str, ObserveConfig]) -> str:
+    """The file that `load_models` reads back as these models, with defaults filled in."""
+    first = next(iter(models.values()))
+    if len(models) == 1:
+        return dump(first)
+    own = [{"name": name, **_raw(model, {"task", "prior"})} for name, model in models.items()]
+    return to_yaml({"tasks": own, **_raw(first, set(ObserveConfig.model_fields) - {"task", "prior"})})
+
+
+def _raw(model: ObserveConfig, keys: set[str]) -> dict[str, Any]:
+    return model.model_dump(mode="json", exclude_none=True, include=keys)

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import re
 import reprlib
+from collections.abc import Sequence
 from typing import Annotated
 
 from pydantic import BeforeValidator, Field
 
 from torchfsid.config.documents import wrong
+from torchfsid.errors import ConfigError
+
+DECIMAL = re.compile(r"\s*[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?\s*", re.ASCII)
+"""How numbers are written."""
 
 
 def as_number(value: object) -> object:
-    """PyYAML takes 1e-6, a number without a dot, for text."""
-    try:
-        return float(value) if isinstance(value, str) else value
-    except ValueError:
-        return value
+    """PyYAML takes 1e-6, a number without a dot, for text. What only Python reads as a number, like 1_0, stays text."""
+    return float(value) if isinstance(value, str) and DECIMAL.fullmatch(value) else value
 
 
 def _name(value: object) -> object:
@@ -24,6 +27,8 @@ def _name(value: object) -> object:
         return str(value)
     if not isinstance(value, str) or not value:
         raise wrong(f"expected a name, got {reprlib.repr(value)} (put names in quotes)")
+    if "\0" in value:
+        raise wrong(f"expected a name without a NUL, got {reprlib.repr(value)}")
     return value
 
 
@@ -34,3 +39,17 @@ Flag = Annotated[bool, Field(strict=True)]
 BodyName = Annotated[str, BeforeValidator(_name)]
 Vector = Annotated[tuple[Number, ...], Field(min_length=1)]
 PlanarVector = Annotated[tuple[Number, ...], Field(min_length=2, max_length=2)]
+
+
+def require_body(path: str, name: str, bodies: Sequence[str]) -> None:
+    """Raises `ConfigError` if the file names, at `path`, a body that is not there."""
+    if name not in bodies:
+        raise ConfigError(f"{path}: no body is called {name!r}; there are {reprlib.repr(list(bodies))}")
+
+
+def require_box(lower: Sequence[float], upper: Sequence[float]) -> None:
+    if len(lower) != len(upper):
+        raise wrong(f"lower has {len(lower)} entries, upper has {len(upper)}")
+    for i, (low, high) in enumerate(zip(lower, upper, strict=True)):
+        if not low < high:
+            raise wrong(f"lower[{i}] must be less than upper[{i}], got {low} and {high}")

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-import reprlib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, model_validator
 
 from torchfsid.config.documents import Strict, wrong
-from torchfsid.config.quantities import BodyName, NonNegative, Number, PlanarVector, Positive
-from torchfsid.errors import ConfigError
+from torchfsid.config.quantities import BodyName, NonNegative, Number, PlanarVector, Positive, require_body
 
 if TYPE_CHECKING:
     from torchfsid.robots.tasks import Task
@@ -46,6 +44,16 @@ class _Task(Strict):
         """p, the number of entries of theta."""
         return 2
 
+    @property
+    def is_clipped(self) -> bool:
+        """Is the nominal control other than C theta + d somewhere?"""
+        return False
+
+    @property
+    def required(self) -> tuple[str, ...]:
+        """The bodies without which a measurement says nothing about theta."""
+        return ()
+
 
 class GoalConfig(_Task):
     """`GoalTask`: go to a goal with a known gain [1/s]; clipped; not at all within `dead_zone` of it [m]."""
@@ -62,6 +70,10 @@ class GoalConfig(_Task):
         return self
 
     @property
+    def is_clipped(self) -> bool:
+        return self.saturation is not None or self.dead_zone > 0
+
+    @property
     def _limits(self) -> tuple[float, float]:
         if self.saturation is None:
             return math.inf, math.inf
@@ -71,7 +83,7 @@ class GoalConfig(_Task):
     def build(self, bodies: Sequence[str]) -> Task:
         from torchfsid.robots.tasks import GoalTask, Saturation
 
-        if self.saturation is None and self.dead_zone == 0:
+        if not self.is_clipped:
             return GoalTask(self.gain)
         shape = "norm" if self.saturation is None else self.saturation.kind
         return GoalTask(self.gain, saturation=Saturation(shape, self._limits, self.gain * self.dead_zone))
@@ -109,6 +121,10 @@ class FormationConfig(_Task):
     kind: Literal["formation"] = "formation"
     gain: Positive
     leader: BodyName
+
+    @property
+    def required(self) -> tuple[str, ...]:
+        return (self.leader,)
 
     def build(self, bodies: Sequence[str]) -> Task:
         from torchfsid.robots.tasks import FormationTask
@@ -151,9 +167,3 @@ TaskConfig = Annotated[
     GoalConfig | UnknownGainGoalConfig | VelocityConfig | FormationConfig | OrbitConfig | PatrolConfig,
     Field(discriminator="kind"),
 ]
-
-
-def require_body(path: str, name: str, bodies: Sequence[str]) -> None:
-    """Raises `ConfigError` if the file names, at `path`, a body that is not there."""
-    if name not in bodies:
-        raise ConfigError(f"{path}: no body is called {name!r}; there are {reprlib.repr(list(bodies))}")

@@ -26,5 +26,9 @@ def active_set(
         raise InputError("tolerance", "a positive speed [m/s]", tolerance)
     if u.shape[-1] != safe_controls.dim:
         raise InputError("u", f"(*batch, {safe_controls.dim})", tuple(u.shape))
-    is_row = (safe_controls.A != 0).any(-1)
-    return (safe_controls.slack(u).abs() < tolerance) & is_row
+    return touched(safe_controls, safe_controls.slack(u), tolerance)
+
+
+def touched(rows: Halfspaces, slack: Float[Tensor, "*batch m"], tolerance: float) -> Bool[Tensor, "*batch m"]:
+    """The rows that are active, given their slacks [m/s]."""
+    return (slack.abs() < tolerance) & (rows.A != 0).any(-1)

@@ -10,18 +10,13 @@ which rows are active, and equals the critical region of multiparametric quadrat
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchfsid.halfspaces import Halfspaces
-from torchfsid.identification.kkt import outward_normals, solve_kkt
-from torchfsid.tolerances import RANK_TOLERANCE
-
-FAN = 3
-"""Normals of a ray: two sides and a cap."""
+from torchfsid.halfspaces import Halfspaces, dot
+from torchfsid.identification.kkt import KktSolution, outward_normals, solve_kkt
+from torchfsid.tolerances import CRITICAL_NORMALS, RANK_TOLERANCE
 
 
 def critical_region(
@@ -36,19 +31,24 @@ def critical_region(
     not be negative. Controls are planar (n = 2); p is any.
     """
     C, d = C.to(torch.float64), d.to(torch.float64)
-    kkt = solve_kkt(safe_controls, active, C, d)
-    unit = safe_controls.normalised()
-    # A row inside the span of the active rows cannot see theta: u* does not move along it.
-    sees_theta = (unit.A - unit.A @ kkt.projector).square().sum(-1) > RANK_TOLERANCE**2
-    inactive = unit.pullback(kkt.G, kkt.f).where(sees_theta & ~active)
-    inactive = replace(inactive, source=torch.arange(safe_controls.rows, device=active.device))
+    return region_of(safe_controls.normalised(), solve_kkt(safe_controls, active, C, d), C, d)
 
-    # C theta + d - u* = P (C theta + d) - A_a^+ b_a lies in the span of the active rows: normals across it say nothing.
-    normals, generator = outward_normals(unit.A, active, FAN)
+
+def region_of(
+    unit: Halfspaces, kkt: KktSolution, C: Float[Tensor, "*batch n p"], d: Float[Tensor, "*batch n"]
+) -> Halfspaces:
+    """`critical_region` of unit rows whose KKT conditions are solved."""
+    # A row inside the span of the active rows cannot see theta: u* does not move along it.
+    across = unit.A.detach() @ kkt.free.detach()
+    sees_theta = dot(across, across) > RANK_TOLERANCE**2
+    # C theta + d - u* = P (C theta + d - A_a^+ b_a) lies in the span of the active rows: normals across it say nothing.
+    normals, generator = outward_normals(unit.A, kkt.active, CRITICAL_NORMALS)
     along = normals @ kkt.projector
-    multipliers = Halfspaces(
-        along @ C,
-        (normals @ kkt.offset.unsqueeze(-1) - along @ d.unsqueeze(-1)).squeeze(-1),
-        safe_controls.rows + generator,
-    ).where(along.square().sum(-1) > RANK_TOLERANCE**2)
-    return Halfspaces.stack([inactive, multipliers])
+    j = torch.arange(unit.rows, device=generator.device).expand(kkt.active.shape)
+    motion = torch.cat([kkt.G, kkt.f.unsqueeze(-1)], dim=-1)
+    push = torch.cat([C, (d - kkt.offset).unsqueeze(-1)], dim=-1)
+    rows = torch.cat([unit.A @ motion, along @ push], dim=-2)
+    bounds = torch.nn.functional.pad(unit.b, (0, along.shape[-2]))
+    return Halfspaces(rows[..., :-1], bounds - rows[..., -1], torch.cat([j, unit.rows + generator], dim=-1)).where(
+        torch.cat([sees_theta & ~kkt.active, dot(along, along) > RANK_TOLERANCE**2], dim=-1)
+    )

@@ -1,168 +1,245 @@
-r"""What one measurement says about theta, for B robots at once.
+r"""What one measurement says about theta: from positions and a control to half-spaces, for B robots at once.
 
     rows A u <= b, task (C, d), control u  ->  slacks  ->  active rows  ->  KKT conditions  ->  half-spaces of theta
 
-A sample is used where the model could be evaluated and no hard row is violated by more than its bound. In the plane,
-where no gradient is needed, `reading_kernel` does all of it in compiled code.
+A sample says something only if
+    - the robot was observed, and its controller had a solution (`controller_failed`);
+    - the model could be evaluated: no row, and nothing of the task, is NaN or infinite;
+    - the rows of bodies without a slot are provably inactive (`neighbours`);
+    - no hard row is violated by more than its bound: otherwise model or bounds are wrong, and the sample is alarming;
+    - no row that may be active may point anywhere (a body at the robot's own place, within the errors of positions).
+
+The measurements of a whole log, concatenated, are one batch. In the plane, where no gradient is needed, compiled code
+does the same from the slacks on (`kernels.evidence`).
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Literal
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchfsid.halfspaces import Halfspaces, array, finite
-from torchfsid.identification.active_set import active_set
-from torchfsid.identification.critical_region import FAN as CRITICAL_FAN
-from torchfsid.identification.critical_region import critical_region
-from torchfsid.identification.inverse_optimal import FAN, SPREAD, inverse_optimal_set, per_row
-from torchfsid.identification.kkt import KktSolution, solve_kkt
-from torchfsid.kernels.compiled import use_kernel
-from torchfsid.robots.bounds import NoiseBound, Uncertainty
-from torchfsid.robots.tasks import Saturation
-from torchfsid.tolerances import ANGLE_TOLERANCE, RANK_TOLERANCE, ROUND_OFF
+from torchfsid.errors import InputError
+from torchfsid.halfspaces import Halfspaces, array, dot, finite
+from torchfsid.identification.active_set import touched
+from torchfsid.identification.critical_region import region_of
+from torchfsid.identification.inverse_optimal import per_row, set_around, without_direction
+from torchfsid.identification.kkt import KktSolution, solve_unit
+from torchfsid.kernels import evidence as kernel
+from torchfsid.robots.barriers import Barrier, controller_failed, row_errors
+from torchfsid.robots.bounds import ErrorBounds, NoiseBound, RowErrors
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.neighbours import left_out_inactive
+from torchfsid.robots.tasks import Task
+from torchfsid.sets.feasible_set import FeasibleSet
+from torchfsid.tolerances import ACTIVE_TOLERANCE, ROUND_OFF
 
 SetKind = Literal["critical_region", "inverse_optimal"]
 
-_SPREAD = np.array(SPREAD)
-_AROUND = {
-    kind: np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    for kind, turn in (
-        ("critical_region", np.linspace(0.0, 2 * np.pi, CRITICAL_FAN)),
-        ("inverse_optimal", np.linspace(0.0, 2 * np.pi, FAN)),
-    )
-}
 
-
-class Model(NamedTuple):
-    """The declared model at one instant; NaN and infinite where it could not be evaluated.
+@dataclass(frozen=True)
+class ObservationModel:
+    """What is declared about the robots, and how their motions are read.
 
     Attributes:
-        safe_controls: the rows. hard: those that no controller may violate.
-        C, d: the task. saturation, possible: see `inverse_optimal_set`.
+        task, barriers: what the robots do.
+        kind: `critical_region` (the paper's Omega: for exact data of exact controllers) or `inverse_optimal`.
+        noise: bounds for `inverse_optimal` and for the alarm.
+        active_tolerance: when a row counts as active for `critical_region`, for the case label and for (G, f) [m/s].
+
+    Raises:
+        InputError: `inverse_optimal` comes without `noise`, `critical_region` with a clipped nominal control, or
+            `active_tolerance` is not positive.
     """
 
-    safe_controls: Halfspaces
-    hard: Bool[Tensor, "m"]
-    C: Float[Tensor, "B n p"]
-    d: Float[Tensor, "B n"]
-    saturation: Saturation | None
-    possible: Float[Tensor, "B v n"] | None
+    task: Task
+    barriers: Sequence[Barrier]
+    kind: SetKind = "inverse_optimal"
+    noise: NoiseBound | None = None
+    active_tolerance: float = ACTIVE_TOLERANCE
+
+    def __post_init__(self) -> None:
+        if self.kind == "inverse_optimal" and self.noise is None:
+            raise InputError("noise", "a NoiseBound, since the set is inverse_optimal", None)
+        if self.kind == "critical_region" and self.task.saturation is not None:
+            raise InputError("kind", "inverse_optimal, since the nominal control is clipped", self.kind)
+        if not self.active_tolerance > 0:
+            raise InputError("active_tolerance", "a positive speed [m/s]", self.active_tolerance)
 
 
-class Bounds(NamedTuple):
-    """What may be off: the declared bounds, what errors of positions come to, and when a row counts as active [m/s]."""
-
-    noise: NoiseBound | None
-    uncertainty: Uncertainty | None
-    active_tolerance: float
-
-    def slack(self, like: Tensor) -> Tensor:
-        """How far from its boundary an active row may be measured [m/s], broadcasting with slacks (B, m)."""
-        bound = per_row(self.active_tolerance if self.noise is None else self.noise.slack, like)
-        return bound if self.uncertainty is None else bound + self.uncertainty.slack
-
-    def ball(self, like: Tensor) -> Tensor:
-        """The error of C theta + d - u [m/s], broadcasting with (B,)."""
-        bound = torch.as_tensor(
-            0.0 if self.noise is None else self.noise.velocity, dtype=like.dtype, device=like.device
-        )
-        return bound if self.uncertainty is None else bound + self.uncertainty.velocity + self.uncertainty.drift
-
-    def tensors(self) -> list[Tensor]:
-        noise = () if self.noise is None else (self.noise.velocity, self.noise.slack)
-        return [bound for bound in (*noise, *(self.uncertainty or ())) if isinstance(bound, Tensor)]
-
-
-class Reading(NamedTuple):
+@dataclass(frozen=True)
+class Evidence:
     """What one measurement says by itself.
 
     Attributes:
-        omega: half-spaces of theta; padding where the sample is not used.
-        kkt: u* = G theta + f at the observed active set.
-        informative: the sample is used. alarmed: it is not, because a hard row is violated beyond its bound.
-        safe_controls, C, d: the model at this measurement, zeros where it could not be evaluated.
-        slack: of the measured control to every row [m/s]. excess: its violation beyond the bound, positive if there is
-            any [m/s]. hard: the rows that no controller may violate.
+        omega: half-spaces of theta; padding where the sample is not used. See `critical_region` and
+            `inverse_optimal_set` for their sources.
+        informative: the sample is used.
+        alarmed: it is not, because a hard row is violated beyond its bound.
+        slack: of the measured control to every row [m/s].
+        excess: violation of every row beyond its bound, positive if there is any [m/s].
+        hard: the rows that no controller may violate.
+        solve: solves the KKT conditions; ask for `kkt`.
     """
 
     omega: Halfspaces
-    kkt: KktSolution
     informative: Bool[Tensor, "B"]
     alarmed: Bool[Tensor, "B"]
-    safe_controls: Halfspaces
-    C: Float[Tensor, "B n p"]
-    d: Float[Tensor, "B n"]
     slack: Float[Tensor, "B m"]
     excess: Float[Tensor, "B m"]
     hard: Bool[Tensor, "m"]
+    solve: Callable[[], KktSolution]
+
+    @cached_property
+    def kkt(self) -> KktSolution:
+        """u* = G theta + f at the observed active set; solved once, when somebody asks."""
+        return self.solve()
 
 
-def read(
-    kind: SetKind,
-    model: Model,
-    u: Float[Tensor, "B n"],
-    usable: Bool[Tensor, "B"],
-    bounds: Bounds,
-    compiled: bool | None = None,
-) -> Reading:
-    """What a measurement says about theta. `usable` marks the robots that were measured under control; `compiled`:
-    see `use_kernel`, for planar u and theta without saturation only.
+@dataclass(frozen=True)
+class _Sample:
+    """The model at one measurement; NaN and infinite where it could not be evaluated.
+
+    Attributes:
+        rows: A u <= b. hard: those that no controller may violate.
+        u: the measured control [m/s]. C, d: the nominal control C theta + d.
+        usable: what may say something, as far as that is known before the rows are looked at.
+        bound: the slack with which an active row may be measured [m/s], broadcasting with (B, m).
+        ball, drift: errors of u and of C theta + d [m/s], broadcasting with (B,).
+        row_errors: of the rows; None: they are exact.
+        corners: of Theta; None: nobody needs them.
+    """
+
+    rows: Halfspaces
+    hard: Bool[Tensor, "m"]
+    u: Float[Tensor, "B n"]
+    C: Float[Tensor, "B n p"]
+    d: Float[Tensor, "B n"]
+    usable: Bool[Tensor, "B"]
+    bound: Float[Tensor, "*#rows"]
+    ball: Float[Tensor, "*#B"]
+    drift: Float[Tensor, "*#B"]
+    row_errors: RowErrors | None
+    corners: Float[Tensor, "B v p"] | None
+
+
+def evidence(
+    model: ObservationModel, theta: FeasibleSet, measurement: Measurement, compiled: bool | None = None
+) -> Evidence:
+    """What a measurement says about theta.
+
+    Args:
+        model: what is declared.
+        theta: what is known of the robots so far, batch (B,). Only clipped nominal controls, and position errors of
+            tasks with an unknown gain, look at it.
+        measurement: of these robots, or several such measurements concatenated.
+        compiled: run compiled code, or the same in torch; None: compiled wherever it can, that is where controls and
+            theta are planar, nothing is clipped, no gradient is needed and tensors are on the CPU.
 
     Raises:
-        InputError: `compiled` is True and cannot be.
+        InputError: the measurement has no velocities, or they are not finite where the robot was observed; it does not
+            fit theta; or `compiled` is True and cannot be.
     """
-    rows, C, d = model.safe_controls, model.C, model.d
-    planar = rows.dim == C.shape[-1] == 2 and model.saturation is None
-    if planar and use_kernel(compiled, rows.A, rows.b, C, d, u, *bounds.tensors()):
-        return _read_compiled(kind, model, u, usable, bounds)
-    if not finite(rows.A, rows.b, C, d):
-        rows, C, d, known = _evaluated(rows, C, d)
-        usable = usable & known
-    slack = rows.slack(u)
-    excess = -slack - bounds.slack(slack) - rows.round_off(u)
-    alarmed = usable & ((excess > 0) & model.hard).any(-1)
+    sample = _sample(model, theta, measurement.observed_only())
+    if _can_be_compiled(model, sample, compiled):
+        return _compiled(model, sample)
+    return _in_torch(model, sample)
+
+
+def _sample(model: ObservationModel, theta: FeasibleSet, measurement: Measurement) -> _Sample:
+    assert measurement.u is not None
+    robots, items, u = theta.batch_shape.numel(), len(measurement.x), measurement.u.to(torch.float64)
+    if measurement.x.ndim != 2 or len(theta.batch_shape) != 1 or items % max(robots, 1) != 0:
+        expected = f"a batch of {tuple(theta.batch_shape)} robots, or several of them"
+        raise InputError("measurement", expected, tuple(measurement.x.shape))
+    parts = [barrier(measurement) for barrier in model.barriers]
+    rows, (C, d) = Halfspaces.stack(parts), model.task(measurement)
+    soft = [b.soft for b, part in zip(model.barriers, parts, strict=True) for _ in range(part.rows)]
+
+    noise = NoiseBound(0.0, model.active_tolerance) if model.noise is None else model.noise
+    bound, ball, drift = per_row(noise.slack, u), per_row(noise.velocity, u).squeeze(-1), u.new_zeros(())
+    if measurement.velocity_error is not None:
+        bound, ball = bound + measurement.velocity_error.unsqueeze(-1), ball + measurement.velocity_error
+    largest = bound.squeeze(-1)  # slack of an active row whose position is exact
+    errors, of_rows, corners = ErrorBounds.of(measurement, model.noise), None, None
+    if errors is not None or model.task.saturation is not None:
+        corners = theta.vertices().repeat(items // max(robots, 1), 1, 1)
+        if errors is not None:
+            of_rows = row_errors(model.barriers, parts, measurement, errors)
+            bound, drift = bound + of_rows.slack, model.task.drift(errors, corners.abs().amax(-2))
+    usable = ~controller_failed(model.barriers, measurement, rows, of_rows)
+    if measurement.observed is not None:
+        usable = usable & measurement.observed
+    if measurement.left_out is not None:
+        error = u.new_tensor(2 * noise.position)
+        if measurement.position_error is not None:
+            error = error + measurement.position_error
+        usable = usable & left_out_inactive(model.barriers, measurement, largest + noise.neighbour_velocity, error)
+
+    return _Sample(
+        rows, ~torch.tensor(soft, dtype=torch.bool, device=u.device), u, C.to(torch.float64), d.to(torch.float64),
+        usable, bound, ball, drift, of_rows, corners,
+    )  # fmt: skip
+
+
+def _in_torch(model: ObservationModel, sample: _Sample) -> Evidence:
+    rows, C, d, usable, u = sample.rows, sample.C, sample.d, sample.usable, sample.u
+    if not finite(rows.A, rows.b, C, d):  # padding and zeros in place of what could not be evaluated
+        are_known = rows.b.isfinite() & rows.A.isfinite().all(-1)
+        wish_known = C.isfinite().all(-1).all(-1) & d.isfinite().all(-1)
+        C, d = torch.where(wish_known[:, None, None], C, 0.0), torch.where(wish_known[:, None], d, 0.0)
+        rows, usable = rows.where(are_known), usable & are_known.all(-1) & wish_known
+    unit = rows.normalised()
+    slack = unit.b - dot(unit.A, u.unsqueeze(-2))
+    room = sample.bound + ROUND_OFF * (dot(unit.A.abs(), u.abs().unsqueeze(-2)) + unit.b.abs()).detach()
+    excess, near = -slack - room, slack <= room
+    alarmed = usable & ((excess > 0) & sample.hard).any(-1)
     informative = usable & ~alarmed
-    active = active_set(rows, u, bounds.active_tolerance)
-    kkt = solve_kkt(rows, active, C, d)
-    if kind == "critical_region":
-        omega = critical_region(rows, active, C, d)
+    if sample.row_errors is not None:
+        informative = informative & ~(near & without_direction(unit, sample.row_errors)).any(-1)
+    solve = partial(solve_unit, unit, touched(unit, slack, model.active_tolerance), C, d)
+    if model.kind == "critical_region":
+        kkt = solve()
+        omega, solve = region_of(unit, kkt, C, d), lambda: kkt
     else:
-        assert bounds.noise is not None
-        omega = inverse_optimal_set(
-            rows, u, C, d, bounds.noise,
-            uncertainty=bounds.uncertainty, saturation=model.saturation, possible=model.possible,
+        omega = set_around(
+            unit, near, sample.row_errors, u, C, d, sample.ball, sample.drift,
+            model.task.saturation, None if sample.corners is None else sample.corners @ C.mT + d.unsqueeze(-2),
         )  # fmt: skip
     omega = omega.where(informative.unsqueeze(-1))
-    return Reading(omega, kkt, informative, alarmed, rows, C, d, slack, excess, model.hard)
+    return Evidence(omega, informative, alarmed, slack, excess, sample.hard, solve)
 
 
-def _read_compiled(kind: SetKind, model: Model, u: Tensor, usable: Bool[Tensor, "B"], bounds: Bounds) -> Reading:
-    from torchfsid.kernels import evidence as reading_kernel
+def _can_be_compiled(model: ObservationModel, sample: _Sample, wanted: bool | None) -> bool:
+    if wanted is False:
+        return False
+    tensors = [sample.rows.A, sample.rows.b, sample.C, sample.d, sample.u, sample.bound, sample.ball, sample.drift]
+    obstacle = None
+    if not sample.rows.dim == sample.C.shape[-1] == 2 or model.task.saturation is not None:
+        obstacle = "theta is not planar, or the nominal control is clipped"
+    elif torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
+        obstacle = "gradients are required"
+    elif not all(tensor.is_cpu for tensor in tensors):
+        obstacle = "tensors are not on the CPU"
+    if wanted and obstacle is not None:
+        raise InputError("compiled", "False or None", f"True, but {obstacle}")
+    return obstacle is None
 
-    paper, rows, C, d = kind == "critical_region", model.safe_controls, model.C, model.d
-    angles = u[:, :0] if paper or bounds.uncertainty is None else bounds.uncertainty.angle
+
+def _compiled(model: ObservationModel, sample: _Sample) -> Evidence:
+    angles = sample.u[:, :0] if sample.row_errors is None else sample.row_errors.angle
     tensors = (
-        rows.A, rows.b, model.hard, C, d, u, usable,
-        torch.atleast_2d(bounds.slack(u)), angles, torch.atleast_1d(bounds.ball(u)),
+        sample.rows.A, sample.rows.b, sample.hard, sample.C, sample.d, sample.u, sample.usable,
+        torch.atleast_2d(sample.bound), angles, torch.atleast_1d(sample.ball + sample.drift),
     )  # fmt: skip
-    tolerances = bounds.active_tolerance, ROUND_OFF, RANK_TOLERANCE, ANGLE_TOLERANCE
-    arguments: tuple[Any, ...] = (*map(array, tensors), _SPREAD, _AROUND[kind], paper, *tolerances)
-    omega, judged, kkt, evaluated = reading_kernel.read(*arguments)
-    if not evaluated:
-        rows, C, d, _ = _evaluated(rows, C, d)
+    paper = model.kind == "critical_region"
+    rows, judged, kkt = kernel.evidence(*map(array, tensors), paper, model.active_tolerance)
     informative, alarmed, slack, excess = map(torch.from_numpy, judged)
-    omega, kkt = Halfspaces(*map(torch.from_numpy, omega)), KktSolution(*map(torch.from_numpy, kkt))
-    return Reading(omega, kkt, informative, alarmed, rows, C, d, slack, excess, model.hard)
-
-
-def _evaluated(rows: Halfspaces, C: Tensor, d: Tensor) -> tuple[Halfspaces, Tensor, Tensor, Bool[Tensor, "B"]]:
-    """Padding and zeros in place of what could not be evaluated, and which robots' models could be as a whole."""
-    are_known = rows.b.isfinite() & rows.A.isfinite().all(-1)
-    wish_known = C.isfinite().all(-1).all(-1) & d.isfinite().all(-1)
-    C, d = torch.where(wish_known[:, None, None], C, 0.0), torch.where(wish_known[:, None], d, 0.0)
-    return rows.where(are_known), C, d, are_known.all(-1) & wish_known
+    solved = KktSolution(*map(torch.from_numpy, kkt))
+    omega = Halfspaces(*map(torch.from_numpy, rows))
+    return Evidence(omega, informative, alarmed, slack, excess, sample.hard, lambda: solved)

@@ -10,28 +10,27 @@ fan of normals, an outer polygon. An intersection over time never forgives one w
 this set is not wrong when a solver is inexact or a row is nearly active.
 
 Positions that are known up to a bound turn the rows, move their boundaries and shift C theta + d: the generators become
-fans, the slack test and the ball grow (`Uncertainty`). A clipped nominal control opens the set in the directions of
-saturation (`saturation`). Each widening is an outer one. (Not in the paper; proofs in docs/theory.md.)
+fans and the slack test grows (`RowErrors`), and so does the ball, by the drift of C theta + d. A row of which no
+direction is known, and which may be active, is a generator in all directions: nothing is said then. Only a zero row
+without such an error is padding. A clipped nominal control opens the set in the directions of saturation
+(`saturation`). Each widening is an outer one. (Not in the paper; proofs in docs/theory.md.)
 """
 
 from __future__ import annotations
 
+import math
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchfsid.errors import InputError
-from torchfsid.halfspaces import Halfspaces
+from torchfsid.halfspaces import Halfspaces, dot
 from torchfsid.identification.kkt import outward_normals
 from torchfsid.identification.saturation import unclipped
-from torchfsid.robots.bounds import NoiseBound, Uncertainty
+from torchfsid.robots.bounds import NoiseBound, RowErrors
 from torchfsid.robots.tasks import Saturation
-
-FAN = 17
-"""Normals around a full turn, ends counted twice: 22.5 degrees apart, 1.3 % more area than the disc they replace."""
-
-SPREAD = (-1.0, -1 / 3, 1 / 3, 1.0)
-"""A row of uncertain direction is a fan of generators at these fractions of its angle: dense enough for any angle."""
+from torchfsid.tolerances import NORMALS, SPREAD
 
 
 def inverse_optimal_set(
@@ -41,7 +40,8 @@ def inverse_optimal_set(
     d: Float[Tensor, "*batch n"],
     noise: NoiseBound,
     *,
-    uncertainty: Uncertainty | None = None,
+    row_errors: RowErrors | None = None,
+    drift: Float[Tensor, "*batch"] | float = 0.0,
     saturation: Saturation | None = None,
     possible: Float[Tensor, "*batch v n"] | None = None,
 ) -> Halfspaces:
@@ -50,42 +50,69 @@ def inverse_optimal_set(
     `source` is m + j where a half-space comes from the multiplier of row j, 2 m where no single row is to blame.
 
     Args:
-        uncertainty: what position errors and the like add to `noise`; its own `position` and `neighbour_velocity` are
-            not looked at here, the observer turns them into this.
-        saturation: the nominal control is clipped. possible: points whose convex hull holds every C theta + d that is
-            still possible [m/s], required with a saturation.
+        safe_controls: the rows A u <= b.
+        u: the measured control [m/s].
+        C, d: the nominal control C theta + d.
+        noise: `velocity` and `slack` of it; its bounds on positions and neighbours come in as the next two.
+        row_errors: how far the rows may be off; None: they are exact.
+        drift: how far C theta + d may be off [m/s].
+        saturation: the nominal control is clipped.
+        possible: points whose convex hull holds every C theta + d that is still possible [m/s], required with a
+            saturation.
 
     Raises:
         InputError: a saturation without `possible`, or controls that are not planar.
     """
     u, C, d = u.to(torch.float64), C.to(torch.float64), d.to(torch.float64)
-    m, generators = safe_controls.rows, safe_controls.A
-    slack, ball = per_row(noise.slack, u), per_row(noise.velocity, u).squeeze(-1)
-    drift = u.new_zeros(())
-    if uncertainty is not None:
-        slack, ball, drift = slack + uncertainty.slack, ball + uncertainty.velocity, uncertainty.drift
-    near = safe_controls.slack(u) <= slack + safe_controls.round_off(u)
-    may_be_active = (generators != 0).any(-1) & near
-    if uncertainty is not None:
-        generators = torch.cat([_turned(generators, fraction * uncertainty.angle) for fraction in SPREAD], dim=-2)
+    unit = safe_controls.normalised()
+    bound = per_row(noise.slack, u) + (0.0 if row_errors is None else row_errors.slack)
+    near = unit.slack(u) <= bound + unit.round_off(u)
+    ball = per_row(noise.velocity, u).squeeze(-1)
+    return set_around(unit, near, row_errors, u, C, d, ball, per_row(drift, u).squeeze(-1), saturation, possible)
+
+
+def set_around(
+    unit: Halfspaces,
+    near: Bool[Tensor, "*batch m"],
+    row_errors: RowErrors | None,
+    u: Float[Tensor, "*batch n"],
+    C: Float[Tensor, "*batch n p"],
+    d: Float[Tensor, "*batch n"],
+    ball: Float[Tensor, "*#batch"],
+    drift: Float[Tensor, "*#batch"],
+    saturation: Saturation | None,
+    possible: Float[Tensor, "*batch v n"] | None,
+) -> Halfspaces:
+    """`inverse_optimal_set` of unit rows, those `near` the control being the ones that may be active."""
+    m, generators = unit.rows, unit.A
+    if row_errors is None:
+        may_be_active = near & (generators != 0).any(-1)
+    else:
+        unknown = without_direction(unit, row_errors)
+        may_be_active = near & ((generators != 0).any(-1) | unknown)
+        east = generators.new_tensor([1.0, 0.0])
+        generators = torch.where(unknown.unsqueeze(-1), east, generators)
+        angle = torch.where(unknown, math.pi, row_errors.angle)
+        generators = torch.cat([_turned(generators, fraction * angle) for fraction in SPREAD], dim=-2)
         may_be_active = torch.cat([may_be_active] * len(SPREAD), dim=-1)
 
-    normals, generator = outward_normals(generators, may_be_active, FAN)
+    normals, generator = outward_normals(generators, may_be_active, NORMALS)
     source = m + torch.where(generator < generators.shape[-2], generator % max(m, 1), m)
     needed = (normals != 0).any(-1)
     room = (ball + drift).unsqueeze(-1)
     if saturation is None:
-        return Halfspaces(normals @ C, torch.where(needed, _along(normals, u - d) + room, 1.0), source)
+        return Halfspaces(normals @ C, (dot(normals, (u - d).unsqueeze(-2)) + room).masked_fill(~needed, 1.0), source)
     if possible is None:
         raise InputError("possible", "the nominal controls that are still possible, for a saturation", None)
-    nominal = Halfspaces(normals, _along(normals, u) + ball.unsqueeze(-1), source).where(needed)
+    nominal = Halfspaces(normals, dot(normals, u.unsqueeze(-2)) + ball.unsqueeze(-1), source).where(needed)
     nominal = unclipped(nominal, saturation, possible, drift)
     is_row = (nominal.A != 0).any(-1)
     return Halfspaces(nominal.A, nominal.b + drift.unsqueeze(-1) * is_row, nominal.source).pullback(C, d)
 
 
-def _along(normals: Float[Tensor, "*batch k n"], v: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch k"]:
-    return (normals @ v.unsqueeze(-1)).squeeze(-1)
+def without_direction(unit: Halfspaces, row_errors: RowErrors) -> Bool[Tensor, "*batch m"]:
+    """Rows that may point anywhere: turned by up to pi, or vanished where errors could have turned them."""
+    return (row_errors.angle >= math.pi) | ((row_errors.angle > 0) & (unit.A == 0).all(-1))
 
 
 def per_row(bound: float | Float[Tensor, "*batch"], like: Tensor) -> Float[Tensor, "*batch 1"]:

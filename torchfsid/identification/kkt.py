@@ -7,13 +7,14 @@ With A_a, b_a the active rows (the others zeroed by a mask, so that it batches) 
 
     u*(theta) = G theta + f,   G = (I - P) C,   f = A_a^+ b_a + (I - P) d             (G., Eqs. (25), (36), (45), (48))
 
-In the plane A_a^+ has a closed form. With V a rotation to the principal axes of the unit rows, the columns of
-A_a V = [y z] are orthogonal up to round-off, w = z - y (y.z)/(y.y) has the length of the second singular value, and
+In the plane A_a^+ has a closed form. Let the columns of W be an orthonormal basis of the row space, each divided by its
+singular value: the columns of A_a W are orthonormal up to round-off, S = (A_a W)'(A_a W) = I + E with E small, and
 
-    A_a^+ b_a = V [c1, c2],    c2 = w.b/w.w,   c1 = (y.b - c2 y.z)/y.y      (rank 2; at rank 1 y alone counts)
+    A_a^+ b_a = W S^-1 (A_a W)' b_a,     S^-1 = I - E + E^2          (the first and second derivatives are exact, too)
 
-which keeps the digits that the Gram matrix of nearly parallel rows loses, and holds for any V: so V needs no gradient,
-and orthogonal equal rows, where that of an SVD does not exist, are nothing special.
+which keeps the digits that the Gram matrix of nearly parallel rows loses. At rank 2 it holds for any W, so W is found
+without gradients, and orthogonal equal rows, where the derivative of an SVD does not exist, are nothing special. At
+rank 1, W is the rows' direction.
 
 The multipliers exist exactly where  C theta + d - u*(theta)  lies in  cone{a_j : j active}. In the plane this cone
 is written by outward normals: sort the generators by angle; an angular gap of at least 180 degrees is the polar cone's
@@ -32,7 +33,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchfsid.errors import InputError
-from torchfsid.halfspaces import Halfspaces
+from torchfsid.halfspaces import Halfspaces, dot
 from torchfsid.tolerances import ANGLE_TOLERANCE, RANK_TOLERANCE
 
 CASES = "ABCDE"
@@ -78,21 +79,30 @@ def solve_kkt(
         raise InputError("active", f"(*batch, {m})", tuple(active.shape))
     if C.shape[-2] != n or d.shape[-1] != n:
         raise InputError("C, d", f"C (*batch, {n}, p) and d (*batch, {n})", (tuple(C.shape), tuple(d.shape)))
-    C, d = C.to(torch.float64), d.to(torch.float64)
-    unit = safe_controls.normalised()
-    A = torch.where(active.unsqueeze(-1), unit.A, 0.0)
-    b = torch.where(active, unit.b, 0.0)
+    return solve_unit(safe_controls.normalised(), active, C.to(torch.float64), d.to(torch.float64))
+
+
+def solve_unit(
+    unit: Halfspaces,
+    active: Bool[Tensor, "*batch m"],
+    C: Float[Tensor, "*batch n p"],
+    d: Float[Tensor, "*batch n"],
+) -> KktSolution:
+    """`solve_kkt` of unit rows."""
+    n, p = unit.dim, C.shape[-1]
+    A, b = unit.A.masked_fill(~active.unsqueeze(-1), 0.0), unit.b.masked_fill(~active, 0.0)
 
     offset, projector, rank = _solve_planar(A, b) if n == 2 else _solve(A, b)
     identity = torch.eye(n, dtype=A.dtype, device=A.device)
     # At full rank nothing of theta gets through: exactly nothing, not a rounding error of I - P.
-    free = torch.where((rank == n)[..., None, None], 0.0, identity - projector)
+    free = (identity - projector).masked_fill((rank == n)[..., None, None], 0.0)
+    through = free @ torch.cat([C, d.unsqueeze(-1)], dim=-1)
 
     n_active = active.sum(-1)
     several = torch.where(rank < n, 2, torch.where(n_active == n, 3, 4))
     return KktSolution(
-        G=free @ C,
-        f=offset + (free @ d.unsqueeze(-1)).squeeze(-1),
+        G=through[..., :p],
+        f=offset + through[..., p],
         projector=projector,
         free=free,
         offset=offset,
@@ -112,35 +122,41 @@ def _solve(A: Float[Tensor, "*batch m n"], b: Float[Tensor, "*batch m"]) -> tupl
 
 def _solve_planar(A: Float[Tensor, "*batch m 2"], b: Float[Tensor, "*batch m"]) -> tuple[Tensor, Tensor, Tensor]:
     """A^+ b, A^+ A and the rank; the rows are unit rows or zero."""
-    first, second = A.unbind(-1)
-    with torch.no_grad():
-        turn = torch.atan2(2 * (first * second).sum(-1), (first * first - second * second).sum(-1)) / 2
-        cos, sin = turn.cos(), turn.sin()
-    y = cos.unsqueeze(-1) * first + sin.unsqueeze(-1) * second
-    z = cos.unsqueeze(-1) * second - sin.unsqueeze(-1) * first
-    yy, yz, yb = (y * y).sum(-1), (y * z).sum(-1), (y * b).sum(-1)
-    none = yy == 0
-    yy = torch.where(none, 1.0, yy)
-    w = z - y * (yz / yy).unsqueeze(-1)
-    ww, wb = (w * w).sum(-1), (w * b).sum(-1)
-    full = ww > RANK_TOLERANCE**2 * yy
-    c2 = wb / torch.where(full, ww, 1.0)
-    c1 = (yb - yz * c2) / yy
-    vertex = torch.stack([cos * c1 - sin * c2, sin * c1 + cos * c2], dim=-1)
-
+    y, size, across, rank = _principal_axes(A.detach())
+    full = (rank == 2)[..., None, None]
     # Rank 1: the rows' direction, by a step of the power iteration from where it has converged, which has its gradient.
-    direction = (y.detach().unsqueeze(-1) * A).sum(-2)
-    length = torch.where(none, 1.0, direction.square().sum(-1)).sqrt()
+    direction = (A.mT @ y.unsqueeze(-1)).squeeze(-1)
+    length = dot(direction, direction).masked_fill(rank == 0, 1.0).sqrt()
     direction = direction / length.unsqueeze(-1)
-    along = (A * direction.unsqueeze(-2)).sum(-1)
-    share = (along * b).sum(-1) / torch.where(none, 1.0, along.square().sum(-1))
-    line = direction.unsqueeze(-1) * direction.unsqueeze(-2)
+    along = direction / size.unsqueeze(-1)
+    W = torch.stack([torch.where(full[..., 0], along.detach(), along), across], dim=-1)
+
     identity = torch.eye(2, dtype=A.dtype, device=A.device)
-    return (
-        torch.where(full.unsqueeze(-1), vertex, share.unsqueeze(-1) * direction),
-        torch.where(full[..., None, None], identity, line),
-        torch.where(full, 2, torch.where(none, 0, 1)),
-    )
+    columns = A @ W
+    square, right = (columns.mT @ torch.cat([columns, b.unsqueeze(-1)], dim=-1)).split([2, 1], dim=-1)
+    off = square - identity  # E
+    correction = off @ right
+    offset = (W @ (right - correction + off @ correction)).squeeze(-1)
+    line = direction.unsqueeze(-1) * direction.unsqueeze(-2)
+    return offset, torch.where(full, identity, line), rank
+
+
+@torch.no_grad()
+def _principal_axes(A: Float[Tensor, "*batch m 2"]) -> tuple[Tensor, Tensor, Tensor, Int[Tensor, "*batch"]]:
+    """Of rows A: y = A v_1 with v_1 the first principal axis; the first singular value |y| (1: no row); the second
+    axis over its singular value (zero at a lower rank); and the rank."""
+    first, second = A.unbind(-1)
+    turn = torch.atan2(2 * (first * second).sum(-1), ((first + second) * (first - second)).sum(-1)) / 2
+    cos, sin = turn.cos().unsqueeze(-1), turn.sin().unsqueeze(-1)
+    y, z = cos * first + sin * second, cos * second - sin * first
+    yy = y.square().sum(-1, keepdim=True)
+    none = yy == 0
+    share = (y * z).sum(-1, keepdim=True) / torch.where(none, 1.0, yy)
+    ww = (z - y * share).square().sum(-1, keepdim=True)  # orthogonal to y, and as long as the second singular value
+    full = ww > RANK_TOLERANCE**2 * yy
+    across = torch.cat([-sin - cos * share, cos - sin * share], dim=-1) * torch.where(full, ww, 1.0).rsqrt()
+    rank = torch.where(full, 2, torch.where(none, 0, 1)).squeeze(-1)
+    return y, yy.masked_fill(none, 1.0).sqrt().squeeze(-1), across.masked_fill(~full, 0.0), rank
 
 
 class OutwardNormals(NamedTuple):
@@ -167,48 +183,66 @@ def outward_normals(
     if fan < 3:
         raise InputError("fan", "at least 3 normals (two ends and a cap)", fan)
     m, shape = generators.shape[-2], present.shape[:-1]
-    step = torch.arange(fan, dtype=generators.dtype, device=generators.device) / (fan - 1)
-    around = _directions(2 * math.pi * step[:-1])
-    some = present.any(-1).reshape(-1).nonzero().squeeze(-1)
-    cones = math.prod(shape)
-    normals = torch.nn.functional.pad(around, (0, 0, 0, 2)).expand(cones, fan + 1, 2)
-    nearest = torch.full((cones, fan + 1), m, device=present.device)
-    if len(some) > 0:
-        present, generators = present.reshape(-1, m)[some], generators.expand(*shape, m, 2).reshape(-1, m, 2)[some]
-        of_cones, near = _normals_of_cones(generators, present, step)
-        normals, nearest = normals.index_put((some,), of_cones), nearest.index_put((some,), near)
-    return OutwardNormals(normals.reshape(*shape, fan + 1, 2), nearest.reshape(*shape, fan + 1))
+    if m == 0:  # one that is never there
+        generators, present = generators.new_zeros(*shape, 1, 2), present.new_zeros(*shape, 1)
+    generators = generators.expand(*shape, max(m, 1), 2)
+    gaps = _gaps(generators.detach(), present)
+
+    # The rows at the ends of the gaps were found without gradients; the normals are theirs, with gradients.
+    ends = generators.gather(-2, gaps.ends.unsqueeze(-1).expand(*shape, 3, 2))
+    none = ~gaps.some
+    ends = ends.masked_fill(none.unsqueeze(-1), 1.0)
+    first, last, second = torch.atan2(ends[..., 1], ends[..., 0]).unsqueeze(-1).unbind(-2)
+    opening = (last - first + (gaps.turns - math.pi)).masked_fill(none, 2 * math.pi)
+    start = (first + math.pi / 2).masked_fill(none, 0.0)
+    step = torch.linspace(0.0, 1.0, fan, dtype=generators.dtype, device=generators.device)
+    angles = torch.cat([start + step * opening.clamp(min=0), second + math.pi / 2], dim=-1)
+    normals = torch.stack([angles.cos(), angles.sin()], dim=-1)
+
+    inner = torch.where(gaps.some, gaps.is_wide | (gaps.is_open & (step == 0)), step < 1)
+    needed = torch.cat([inner, gaps.is_line], dim=-1)
+    from_first, from_last, from_second = gaps.ends.unsqueeze(-1).unbind(-2)
+    near = torch.cat([torch.where(step < 0.5, from_first, from_last), from_second], dim=-1)
+    return OutwardNormals(normals.masked_fill(~needed.unsqueeze(-1), 0.0), near.masked_fill(none, m))
 
 
-def _normals_of_cones(
-    generators: Float[Tensor, "k m 2"], present: Bool[Tensor, "k m"], step: Float[Tensor, "fan"]
-) -> tuple[Float[Tensor, "k fan+1 2"], Int[Tensor, "k fan+1"]]:
-    """`outward_normals` of cones that have a generator."""
+class _Gaps(NamedTuple):
+    """The widest angular gap between generators, and the second widest.
+
+    Attributes:
+        ends: the generators where the widest gap begins and ends, and the one where the second begins.
+        turns: 2 pi where the widest gap spans the angle pi, at which angles begin anew.
+        some: there are generators. is_open: the widest gap is 180 degrees or more. is_wide: it is more.
+        is_line: both gaps are 180 degrees.
+    """
+
+    ends: Int[Tensor, "*batch 3"]
+    turns: Float[Tensor, "*batch 1"]
+    some: Bool[Tensor, "*batch 1"]
+    is_open: Bool[Tensor, "*batch 1"]
+    is_wide: Bool[Tensor, "*batch 1"]
+    is_line: Bool[Tensor, "*batch 1"]
+
+
+@torch.no_grad()
+def _gaps(generators: Float[Tensor, "*batch m 2"], present: Bool[Tensor, "*batch m"]) -> _Gaps:
     count = present.sum(-1, keepdim=True)
-    safe = torch.where(present.unsqueeze(-1), generators, 1.0)
-    angles, order = torch.where(present, torch.atan2(safe[..., 1], safe[..., 0]), math.inf).sort(-1)
+    angles = torch.atan2(generators[..., 1], generators[..., 0])
+    angles, order = angles.masked_fill(~present, math.inf).sort(-1)
     slot = torch.arange(angles.shape[-1], device=angles.device)
     following = torch.where(slot == count - 1, angles[..., :1] + 2 * math.pi, angles.roll(-1, -1))
     gaps = torch.where(slot < count, following - angles, -math.inf)
-
     widest = gaps.argmax(-1, keepdim=True)
-    start, opening = angles.gather(-1, widest) + math.pi / 2, gaps.gather(-1, widest) - math.pi
-    needed = (opening >= -ANGLE_TOLERANCE) & ((step == 0) | (opening > ANGLE_TOLERANCE))
-
-    # Two gaps of 180 degrees: the cone is a line, and the second gap gives its other side.
+    opening = gaps.gather(-1, widest) - math.pi
     others = gaps.scatter(-1, widest, -math.inf)
     second = others.argmax(-1, keepdim=True)
-    is_line = others.gather(-1, second) >= math.pi - ANGLE_TOLERANCE
-    other_side = torch.where(is_line, angles.gather(-1, second) + math.pi / 2, 0.0)
-
-    normals = _directions(
-        torch.cat([torch.where(needed, start + step * opening.clamp(min=0), 0.0), other_side], dim=-1)
+    wraps = widest >= count - 1
+    places = torch.cat([widest, torch.where(wraps, 0, widest + 1), second], dim=-1)
+    return _Gaps(
+        order.gather(-1, places),
+        2 * math.pi * wraps.to(generators.dtype),
+        count > 0,
+        opening >= -ANGLE_TOLERANCE,
+        opening > ANGLE_TOLERANCE,
+        others.gather(-1, second) >= math.pi - ANGLE_TOLERANCE,
     )
-    end = torch.where(widest == count - 1, 0, widest + 1)
-    near = torch.cat([torch.where(step < 0.5, widest, end), second], dim=-1)
-    needed = torch.cat([needed, is_line], dim=-1).unsqueeze(-1)
-    return torch.where(needed, normals, 0.0), order.gather(-1, near)
-
-
-def _directions(angles: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape 2"]:
-    return torch.stack([angles.cos(), angles.sin()], dim=-1)

@@ -29,7 +29,6 @@ from torchfsid.halfspaces import Halfspaces
 from torchfsid.identification.kkt import outward_normals
 from torchfsid.outcome import Outcome
 from torchfsid.robots.tasks import Saturation
-from torchfsid.sets.clipping import clip
 from torchfsid.sets.polygon import Polygon
 
 DIRECTIONS = 32
@@ -86,7 +85,8 @@ def _unclipped(
     reach = limits[:, :1] if by_norm else 2 * limits.amax(-1, keepdim=True)
     tangents = Halfspaces(around, reach.expand(-1, DIRECTIONS))
     inside = Halfspaces.stack([admissible, tangents])
-    clipped = clip(corner, inside.A, inside.b, like.new_zeros(batch), torch.zeros_like(inside.b, dtype=torch.long))
+    no_source = torch.zeros_like(inside.b, dtype=torch.long)
+    clipped = corner.clip(inside.A, inside.b, like.new_zeros(batch), no_source, most=inside.rows + 4)
 
     if by_norm:
         outward, touched = _arcs(admissible, limits[:, :1], around)

@@ -1,7 +1,13 @@
-r"""The largest disc in a polygon, in scalar code, compiled by numba: what `Polygon.chebyshev` does in torch.
+r"""The largest disc in a polygon, one polygon at a time: max r s.t. n_i.z + r <= c_i, unit rows n_i.
 
-The linear programme max r s.t. n_i.z + r <= c_i (unit rows) by the dual simplex method: from a basis of three rows,
-exchange one for the row that is violated most, until none is. `polygon` is the reference; tests compare the two.
+The dual simplex method, in the form that the plane allows. A basis is three rows in counter-clockwise order whose
+normals span the plane; with the weights w_i = n_j x n_k >= 0 (j, k the two rows after i) and their sum W,
+
+    w_0 n_0 + w_1 n_1 + w_2 n_2 = 0,      r = (w_0 c_0 + w_1 c_1 + w_2 c_2) / W      (an upper bound of every radius).
+
+The row that the disc violates most enters. It lies between two of the normals, and the one of the two leaves that makes
+the three span the plane again; if either does (the third normal is opposite), the one that leaves the larger W. So
+no basis is singular unless all normals of the polygon are parallel to round-off.
 """
 
 from __future__ import annotations
@@ -10,65 +16,100 @@ import math
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
 
-compiled = njit(cache=True, error_model="numpy", nogil=True)  # no_type_check: these must stay plain functions
+from torchfsid.kernels.compiled import item, launcher
+from torchfsid.tolerances import ROUND_OFF
 
 
-@compiled
+@item
 @no_type_check
-def inscribed(vertices, A, b, count, epsilon):
-    """A largest inscribed disc of each polygon, as in `Polygon.chebyshev`: its rows, centre and radius."""
-    B, V = b.shape
-    basis, centre, radius = np.empty((B, 3), np.int64), np.zeros((B, 2)), np.empty(B)
-    row, right, inverse, solution = np.empty((V, 2)), np.empty(V), np.empty((3, 3)), np.empty(3)
-    for k in range(B):
-        n, half, scale = count[k], 1, 0.0
+def _turn(rows, i, j):
+    """n_i x n_j, to a relative error: through n_j - n_i or n_j + n_i, which are exact where the rows are parallel."""
+    p, q, r, s = rows[i, 0], rows[i, 1], rows[j, 0], rows[j, 1]
+    if p * r + q * s > 0:
+        return p * (s - q) - q * (r - p)
+    return p * (s + q) - q * (r + p)
+
+
+@item
+@no_type_check
+def inscribed_in(rows, right, n, basis, weight, turned):
+    """A largest disc: (x, y, r, is it one?), and the three rows that decide it into `basis`."""
+    half = 1
+    while half < n - 2 and _turn(rows, 0, half + 1) >= 0:
+        half += 1
+    basis[0], basis[1], basis[2] = 0, half, half + 1
+    x = y = r = 0.0
+    for _ in range(3 * n):
+        x, y, r, scale = _touching(rows, right, basis, weight)
+        worst, entering = -np.inf, 0
         for i in range(n):
-            centre[k, 0] += vertices[k, i, 0] / n
-            centre[k, 1] += vertices[k, i, 1] / n
+            violation = rows[i, 0] * x + rows[i, 1] * y + r - right[i]
+            if violation > worst:
+                worst, entering = violation, i
+        if not worst > ROUND_OFF * scale:
+            # False, too, if the normals were parallel and nothing is finite.
+            return x, y, r, worst <= ROUND_OFF * scale
+        for s in range(3):
+            turned[s] = _turn(rows, basis[s], entering)
+        best, leaving = -1.0, -1
+        for s in range(3):
+            j, k = (s + 1) % 3, (s + 2) % 3
+            if turned[s] >= 0 and turned[j] <= 0:  # it lies between these two
+                if turned[k] >= 0 and weight[s] + turned[k] - turned[j] > best:
+                    best, leaving = weight[s] + turned[k] - turned[j], s
+                if turned[k] <= 0 and weight[j] - turned[k] + turned[s] > best:
+                    best, leaving = weight[j] - turned[k] + turned[s], j
+        if leaving < 0:
+            break
+        basis[leaving] = entering
+    return x, y, r, False
+
+
+@item
+@no_type_check
+def _touching(rows, right, basis, weight):
+    """The disc that touches three rows, and the size of the numbers in it: (x, y, r, size). Their weights."""
+    total = r = largest = scale = 0.0
+    one = other = basis[0]
+    for s in range(3):
+        j, k = basis[(s + 1) % 3], basis[(s + 2) % 3]
+        weight[s] = _turn(rows, j, k)
+        total += weight[s]
+        r += weight[s] * right[basis[s]]
+        scale = max(scale, abs(right[basis[s]]))
+        if weight[s] >= largest:  # the centre is where the two that turn most meet
+            largest, one, other = weight[s], j, k
+    r /= total
+    # Across and along the first of them: so both hold to round-off, however little they turn.
+    across, along = right[one] - r, rows[one, 0] * rows[other, 0] + rows[one, 1] * rows[other, 1]
+    along = (right[other] - r - across * along) / largest
+    x, y = across * rows[one, 0] - along * rows[one, 1], across * rows[one, 1] + along * rows[one, 0]
+    return x, y, r, max(scale, abs(x) + abs(y) + abs(r))
+
+
+@launcher
+@no_type_check
+def inscribed(vertices, A, b, count):
+    """Of each polygon (vertices (B, V, 2), rows A (B, V, 2), b (B, V), count (B,)) a largest inscribed disc.
+
+    Returns (centre, radius, basis, found): `basis` (B, 3) are the rows that decide it; where `found` is False, the
+    search has not come to an answer.
+    """
+    B, V = b.shape
+    basis, centre, radius, found = np.zeros((B, 3), np.int64), np.zeros((B, 2)), np.zeros(B), np.zeros(B, np.bool_)
+    rows, right, weight, turned = np.empty((V, 2)), np.empty(V), np.empty(3), np.empty(3)
+    for k in range(B):
+        n, x, y = count[k], 0.0, 0.0
+        for i in range(n):  # about a point of the set, so that small sets far from the origin lose no digits
+            x += vertices[k, i, 0] / n
+            y += vertices[k, i, 1] / n
         for i in range(n):
             norm = math.sqrt(A[k, i, 0] ** 2 + A[k, i, 1] ** 2)
-            row[i, 0], row[i, 1] = A[k, i, 0] / norm, A[k, i, 1] / norm
-            right[i] = b[k, i] / norm - (row[i, 0] * centre[k, 0] + row[i, 1] * centre[k, 1])
-            scale = max(scale, abs(right[i]))
-        while half < n - 2 and row[0, 0] * row[half + 1, 1] - row[0, 1] * row[half + 1, 0] >= 0:
-            half += 1
-        basis[k, 0], basis[k, 1], basis[k, 2] = 0, half, half + 1
-        for _ in range(3 * V):
-            _inverse_with_ones(row, basis[k], inverse)
-            for i in range(3):
-                solution[i] = 0.0
-                for j in range(3):
-                    solution[i] += inverse[i, j] * right[basis[k, j]]
-            worst, entering = -np.inf, 0
-            for i in range(n):
-                violation = row[i, 0] * solution[0] + row[i, 1] * solution[1] + solution[2] - right[i]
-                if violation > worst:
-                    worst, entering = violation, i
-            if not worst > epsilon * scale:
-                break
-            least, leaving = np.inf, 0
-            for j in range(3):
-                share = row[entering, 0] * inverse[0, j] + row[entering, 1] * inverse[1, j] + inverse[2, j]
-                if share > epsilon and max(inverse[2, j], 0.0) / share < least:
-                    least, leaving = max(inverse[2, j], 0.0) / share, j
-            basis[k, leaving] = entering
-        centre[k, 0] += solution[0]
-        centre[k, 1] += solution[1]
-        radius[k] = solution[2]
-    return basis, centre, radius
-
-
-@compiled
-@no_type_check
-def _inverse_with_ones(rows, basis, inverse):
-    for i in range(3):
-        p, q = basis[(i + 1) % 3], basis[(i + 2) % 3]
-        inverse[0, i] = rows[p, 1] - rows[q, 1]
-        inverse[1, i] = rows[q, 0] - rows[p, 0]
-        inverse[2, i] = rows[p, 0] * rows[q, 1] - rows[p, 1] * rows[q, 0]
-    determinant = rows[basis[0], 0] * inverse[0, 0] + rows[basis[0], 1] * inverse[1, 0] + inverse[2, 0]
-    for i in range(3):
-        for j in range(3):
-            inverse[i, j] /= determinant
+            if not 1e-150 < norm < 1e150:  # the squares have lost digits
+                norm = math.hypot(A[k, i, 0], A[k, i, 1])
+            rows[i, 0], rows[i, 1] = A[k, i, 0] / norm, A[k, i, 1] / norm
+            right[i] = (b[k, i] - A[k, i, 0] * x - A[k, i, 1] * y) / norm
+        step_x, step_y, radius[k], found[k] = inscribed_in(rows, right, n, basis[k], weight, turned)
+        centre[k, 0], centre[k, 1] = x + step_x, y + step_y
+    return centre, radius, basis, found

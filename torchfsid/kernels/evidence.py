@@ -1,13 +1,11 @@
-r"""One measurement of many robots in scalar code: slacks, KKT conditions and half-spaces, compiled by numba.
+r"""One measurement of many robots in scalar code: slacks, KKT conditions and half-spaces of theta, in the plane.
 
-What `reading`, `kkt`, `critical_region` and `inverse_optimal` do in torch, one robot after the other; they are the
-reference, tests compare the two. The active rows are solved as there: with V a rotation to the principal axes of the
-unit active rows A_a, the columns of A_a V = [y z] are orthogonal up to round-off, w = z - y (y.z)/(y.y) has the length
-of the second singular value, and
+What `identification` does in torch, one robot after the other; that is the theory, and tests compare the two. The
+active rows are solved along their principal axes: with V a rotation to these axes of the unit active rows A_a, the
+columns of A_a V = [y z] are orthogonal up to round-off, w = z - y (y.z)/(y.y) has the length of the second singular
+value, and
 
     A_a^+ b_a = V [c1, c2],    c2 = w.b/w.w,   c1 = (y.b - c2 y.z)/y.y        (rank 2; at rank 1 only y counts).
-
-Every tolerance is an argument: numba's cache of compiled code does not see what changes in another file.
 """
 
 from __future__ import annotations
@@ -16,38 +14,86 @@ import math
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
 
-compiled = njit(cache=True, error_model="numpy", nogil=True)  # no_type_check: these must stay plain functions
+from torchfsid.kernels.compiled import item, launcher
+from torchfsid.tolerances import ANGLE_TOLERANCE, CRITICAL_NORMALS, NORMALS, RANK_TOLERANCE, ROUND_OFF, SPREAD
 
-TURN = 2 * math.pi
+PI, TURN = math.pi, 2 * math.pi
+DIRECTIONS, CRITICAL_DIRECTIONS = (
+    np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    for turn in (np.linspace(0.0, TURN, NORMALS), np.linspace(0.0, TURN, CRITICAL_NORMALS))
+)
 
 
-@compiled
+@item
 @no_type_check
-def _solve_active(k, A, b, active, rank_tolerance, offset, projector):
-    """A_a^+ b_a and A_a^+ A_a of the unit rows marked `active[k]`; returns (K, rank)."""
+def is_finite(k, C, d):
+    """Is the nominal control known?"""
+    known = math.isfinite(d[k, 0]) and math.isfinite(d[k, 1])
+    known = known and math.isfinite(C[k, 0, 0]) and math.isfinite(C[k, 0, 1])
+    return known and math.isfinite(C[k, 1, 0]) and math.isfinite(C[k, 1, 1])
+
+
+@item
+@no_type_check
+def judge(k, A, b, hard, u, bound, angles, active_tolerance, unit, unit_b, slack, excess, active, near):
+    """Unit rows, slacks, and which rows are active or may be.
+
+    Returns whether all rows are finite, a hard one is broken, and one that may be active may point anywhere.
+    """
+    known, broken, blind, least = True, False, False, bound.shape[1] - 1
+    of_bound, uncertain = min(k, len(bound) - 1), angles.shape[1] > 0
+    for j in range(b.shape[1]):
+        p, q, c = A[k, j, 0], A[k, j, 1], b[k, j]
+        if not (math.isfinite(p) and math.isfinite(q) and math.isfinite(c)):
+            known = False
+            p, q, c = 0.0, 0.0, 1.0
+        is_row = p != 0 or q != 0
+        if is_row:
+            size = p * p + q * q
+            if not 1e-280 < size < 1e280:  # the squares over- or underflow
+                large = max(abs(p), abs(q))
+                p, q, c = p / large, q / large, c / large
+                size = p * p + q * q
+            scale = 1 / math.sqrt(size)
+            p, q, c = p * scale, q * scale, c * scale
+        unit[j, 0], unit[j, 1], unit_b[j] = p, q, c
+        s = c - (p * u[k, 0] + q * u[k, 1])
+        room = bound[of_bound, min(j, least)] + ROUND_OFF * (abs(p * u[k, 0]) + abs(q * u[k, 1]) + abs(c))
+        slack[k, j], excess[k, j] = s, -s - room
+        active[k, j] = is_row and abs(s) < active_tolerance
+        near[j] = is_row and s <= room
+        broken = broken or (hard[j] and excess[k, j] > 0)
+        if uncertain and s <= room:
+            blind = blind or angles[k, j] >= PI or (angles[k, j] > 0 and not is_row)
+    return known, broken, blind
+
+
+@item
+@no_type_check
+def solve_active(k, unit, unit_b, active, offset, projector):
+    """A_a^+ b_a and A_a^+ A_a of the active rows; returns (K, rank)."""
     K, p, q, r = 0, 0.0, 0.0, 0.0
-    for j in range(len(b)):
+    for j in range(len(unit_b)):
         if active[k, j]:
             K += 1
-            p, q, r = p + A[j, 0] ** 2, q + A[j, 0] * A[j, 1], r + A[j, 1] ** 2
+            p, q, r = p + unit[j, 0] ** 2, q + unit[j, 0] * unit[j, 1], r + unit[j, 1] ** 2
     if K == 0:
         return 0, 0
     turn = math.atan2(2 * q, p - r) / 2
     cos, sin = math.cos(turn), math.sin(turn)
     yy = yz = yb = ww = wb = v0 = v1 = 0.0
-    for j in range(len(b)):
+    for j in range(len(unit_b)):
         if active[k, j]:
-            y, z = cos * A[j, 0] + sin * A[j, 1], cos * A[j, 1] - sin * A[j, 0]
-            yy, yz, yb = yy + y * y, yz + y * z, yb + y * b[j]
-            v0, v1 = v0 + y * A[j, 0], v1 + y * A[j, 1]
-    for j in range(len(b)):
+            y, z = cos * unit[j, 0] + sin * unit[j, 1], cos * unit[j, 1] - sin * unit[j, 0]
+            yy, yz, yb = yy + y * y, yz + y * z, yb + y * unit_b[j]
+            v0, v1 = v0 + y * unit[j, 0], v1 + y * unit[j, 1]
+    for j in range(len(unit_b)):
         if active[k, j]:
-            y, z = cos * A[j, 0] + sin * A[j, 1], cos * A[j, 1] - sin * A[j, 0]
+            y, z = cos * unit[j, 0] + sin * unit[j, 1], cos * unit[j, 1] - sin * unit[j, 0]
             w = z - y * yz / yy
-            ww, wb = ww + w * w, wb + w * b[j]
-    if ww > rank_tolerance**2 * yy:
+            ww, wb = ww + w * w, wb + w * unit_b[j]
+    if ww > RANK_TOLERANCE**2 * yy:
         second = wb / ww
         first = (yb - yz * second) / yy
         offset[k, 0], offset[k, 1] = cos * first - sin * second, sin * first + cos * second
@@ -56,23 +102,38 @@ def _solve_active(k, A, b, active, rank_tolerance, offset, projector):
     length = math.sqrt(v0 * v0 + v1 * v1)
     v0, v1 = v0 / length, v1 / length
     yy = yb = 0.0
-    for j in range(len(b)):
+    for j in range(len(unit_b)):
         if active[k, j]:
-            y = A[j, 0] * v0 + A[j, 1] * v1
-            yy, yb = yy + y * y, yb + y * b[j]
+            y = unit[j, 0] * v0 + unit[j, 1] * v1
+            yy, yb = yy + y * y, yb + y * unit_b[j]
     offset[k, 0], offset[k, 1] = v0 * yb / yy, v1 * yb / yy
     projector[k, 0, 0], projector[k, 1, 1] = v0 * v0, v1 * v1
     projector[k, 0, 1] = projector[k, 1, 0] = v0 * v1
     return K, 1
 
 
-@compiled
+@item
 @no_type_check
-def _outward_normals(angle, order, K, none, around, flat, normals, generator):
+def solve_motion(k, C, d, wish_known, rank, offset, projector, free, G, f):
+    """u* = G theta + f, with free = I - P, exactly zero at full rank."""
+    if rank < 2:
+        free[k, 0, 0], free[k, 1, 1] = 1 - projector[k, 0, 0], 1 - projector[k, 1, 1]
+        free[k, 0, 1], free[k, 1, 0] = -projector[k, 0, 1], -projector[k, 1, 0]
+    for i in range(2):
+        f[k, i] = offset[k, i]
+        if wish_known:
+            f[k, i] += free[k, i, 0] * d[k, 0] + free[k, i, 1] * d[k, 1]
+            G[k, i, 0] = free[k, i, 0] * C[k, 0, 0] + free[k, i, 1] * C[k, 1, 0]
+            G[k, i, 1] = free[k, i, 0] * C[k, 0, 1] + free[k, i, 1] * C[k, 1, 1]
+
+
+@item
+@no_type_check
+def outward_normals(angle, order, K, none, around, normals, generator):
     """`kkt.outward_normals` of K generators given by their angles; returns how many normals there are.
 
     `order` names the generators (sorted here, with the angles), `none` stands for no generator, `around` is the fan of
-    a full turn, `flat` the round-off of 180 degrees.
+    a full turn.
     """
     fan = len(around)
     if K == 0:
@@ -93,10 +154,10 @@ def _outward_normals(angle, order, K, none, around, flat, normals, generator):
             widest, gap = i, following
         elif following > other:
             second, other = i, following
-    opening, count = gap - math.pi, 0
-    if opening >= -flat:
-        end, ray = widest + 1 if widest < K - 1 else 0, opening > flat
-        first, turn = angle[widest] + math.pi / 2, max(opening, 0.0)
+    opening, count = gap - PI, 0
+    if opening >= -ANGLE_TOLERANCE:
+        end, ray = widest + 1 if widest < K - 1 else 0, opening > ANGLE_TOLERANCE
+        first, turn = angle[widest] + PI / 2, max(opening, 0.0)
         v, w, cos, sin = math.cos(first), math.sin(first), math.cos(turn / (fan - 1)), math.sin(turn / (fan - 1))
         for i in range(fan if ray else 1):
             if ray and i == fan - 1:  # the two ends must be exact, those between only lie there
@@ -105,19 +166,35 @@ def _outward_normals(angle, order, K, none, around, flat, normals, generator):
             generator[i] = order[widest if 2 * i < fan - 1 else end]
             v, w = v * cos - w * sin, w * cos + v * sin
         count = fan if ray else 1
-    if other >= math.pi - flat:
-        direction = angle[second] + math.pi / 2
+    if other >= PI - ANGLE_TOLERANCE:
+        direction = angle[second] + PI / 2
         normals[count, 0], normals[count, 1], generator[count] = math.cos(direction), math.sin(direction), order[second]
         count += 1
     return count
 
 
-@compiled
+@item
 @no_type_check
-def _critical_region(k, unit, unit_b, C, d, kkt, normals, generator, count, rank_tolerance, row_A, row_b, row_source):
+def find_generators(k, unit, chosen, angles, angle, order):
+    """The angles and names of the chosen rows, each turned by the fractions `SPREAD` of its error; how many?"""
+    K, m, uncertain = 0, len(unit), angles.shape[1] > 0
+    for turn in range(len(SPREAD) if uncertain else 1):
+        for j in range(m):
+            if chosen[j]:
+                angle[K], order[K] = math.atan2(unit[j, 1], unit[j, 0]), turn * m + j
+                if uncertain:
+                    angle[K] = (angle[K] + SPREAD[turn] * angles[k, j] + PI) % TURN - PI
+                K += 1
+    return K
+
+
+@item
+@no_type_check
+def critical_region(
+    k, unit, unit_b, C, d, G, f, P, offset, active, normals, generator, count, row_A, row_b, row_source
+):
     """`critical_region`: the rows that say something."""
-    G, f, P, offset, active = kkt
-    m, R, least = len(unit_b), 0, rank_tolerance**2
+    m, R, least = len(unit_b), 0, RANK_TOLERANCE**2
     for j in range(m):
         p, q = unit[j, 0], unit[j, 1]
         across = (p - p * P[k, 0, 0] - q * P[k, 1, 0]) ** 2 + (q - p * P[k, 0, 1] - q * P[k, 1, 1]) ** 2
@@ -137,38 +214,34 @@ def _critical_region(k, unit, unit_b, C, d, kkt, normals, generator, count, rank
             R += 1
 
 
-@compiled
+@item
 @no_type_check
-def _inverse_optimal(k, m, u, ball, C, d, normals, generator, count, none, row_A, row_b, row_source):
+def inverse_optimal(k, m, u, ball, C, d, normals, generator, count, none, row_A, row_b, row_source):
     """`inverse_optimal_set`."""
-    x, y, room = u[k, 0] - d[k, 0], u[k, 1] - d[k, 1], ball[min(k, len(ball) - 1)]
+    x, y = u[k, 0] - d[k, 0], u[k, 1] - d[k, 1]
     for n in range(count):
         p, q = normals[n, 0], normals[n, 1]
         for i in range(2):
             row_A[k, n, i] = p * C[k, 0, i] + q * C[k, 1, i]
-        row_b[k, n] = p * x + q * y + room
+        row_b[k, n] = p * x + q * y + ball
         row_source[k, n] = 2 * m if generator[n] == none else m + generator[n] % m
 
 
-@compiled
+@launcher
 @no_type_check
-def read(
-    A, b, hard, C, d, u, observed, bound, angles, ball, spread, around, paper, active_tolerance, epsilon,
-    rank_tolerance, flat,
-):  # fmt: skip
+def evidence(A, b, hard, C, d, u, usable, bound, angles, ball, paper, active_tolerance):
     """What a measurement of B robots says about theta, and their KKT conditions.
 
     `bound` (B or 1, m or 1) is the slack of an active row, `ball` (B or 1,) bounds the error of C theta + d - u.
-    `angles` (B, m), errors of the rows' directions, turn each row by the fractions `spread`; (B, 0): there are none.
-    `around` is the fan of a full turn, `paper` asks for the critical region.
+    `angles` (B, m) are errors of the rows' directions; (B, 0): there are none. `paper` asks for the critical region.
 
-    Returns half-spaces (A, b, source), padded; (informative, alarmed, slack, excess), as in `reading.Reading`; (G,
-    f, projector, free, offset, active, n_active, rank, case), as in `kkt.KktSolution`; and whether all rows, C and d
-    are finite.
+    Returns half-spaces (A, b, source), padded; (informative, alarmed, slack, excess), as in `Evidence`; and (G, f,
+    projector, free, offset, active, n_active, rank, case), as in `KktSolution`.
     """
     B, m = b.shape
-    turned = angles.shape[1] > 0 and not paper
-    generators = m * len(spread) if turned else m
+    fan = angles[:, :0] if paper else angles
+    generators = m * len(SPREAD) if fan.shape[1] > 0 else m
+    around = CRITICAL_DIRECTIONS if paper else DIRECTIONS
     R = (m if paper else 0) + len(around) + 1
     row_A, row_b, row_source = np.zeros((B, R, 2)), np.ones((B, R)), np.full((B, R), -1)
     informative, alarmed = np.empty(B, np.bool_), np.empty(B, np.bool_)
@@ -179,62 +252,30 @@ def read(
     unit, unit_b, near = np.zeros((m, 2)), np.empty(m), np.empty(m, np.bool_)
     angle, order = np.empty(generators), np.empty(generators, np.int64)
     normals, generator = np.empty((len(around) + 1, 2)), np.empty(len(around) + 1, np.int64)
-    all_known = True
     for k in range(B):
-        usable, broken = observed[k], False
-        c0, c1, c2, c3, d0, d1 = C[k, 0, 0], C[k, 0, 1], C[k, 1, 0], C[k, 1, 1], d[k, 0], d[k, 1]
-        known = math.isfinite(c0) and math.isfinite(c1) and math.isfinite(c2) and math.isfinite(c3)
-        if not (known and math.isfinite(d0) and math.isfinite(d1)):
-            usable = all_known = False
-            c0 = c1 = c2 = c3 = d0 = d1 = 0.0
-        for j in range(m):
-            p, q, c = A[k, j, 0], A[k, j, 1], b[k, j]
-            if not (math.isfinite(p) and math.isfinite(q) and math.isfinite(c)):
-                usable = all_known = False
-                p, q, c = 0.0, 0.0, 1.0
-            is_row = p != 0 or q != 0
-            scale = 1 / math.sqrt(p * p + q * q) if is_row else 1.0
-            unit[j, 0], unit[j, 1], unit_b[j] = p * scale, q * scale, c * scale
-            s = (c - (p * u[k, 0] + q * u[k, 1])) * scale
-            room = bound[min(k, len(bound) - 1), min(j, bound.shape[1] - 1)]
-            room += epsilon * (abs(p * u[k, 0]) + abs(q * u[k, 1]) + abs(c)) * scale
-            slack[k, j], excess[k, j] = s, -s - room
-            active[k, j] = is_row and abs(s) < active_tolerance
-            near[j] = is_row and s <= room
-            broken = broken or (hard[j] and -s > room)
-        alarmed[k], informative[k] = usable and broken, usable and not broken
-
-        n_active[k], rank[k] = _solve_active(k, unit, unit_b, active, rank_tolerance, offset, projector)
-        K = n_active[k]
-        case[k] = K if K < 2 else 2 if rank[k] < 2 else 3 if K == 2 else 4
-        if rank[k] < 2:
-            free[k, 0, 0], free[k, 1, 1] = 1 - projector[k, 0, 0], 1 - projector[k, 1, 1]
-            free[k, 0, 1], free[k, 1, 0] = -projector[k, 0, 1], -projector[k, 1, 0]
-        for i in range(2):
-            f[k, i] = offset[k, i] + free[k, i, 0] * d0 + free[k, i, 1] * d1
-            G[k, i, 0] = free[k, i, 0] * c0 + free[k, i, 1] * c2
-            G[k, i, 1] = free[k, i, 0] * c1 + free[k, i, 1] * c3
+        known, broken, blind = judge(
+            k, A, b, hard, u, bound, angles, active_tolerance, unit, unit_b, slack, excess, active, near
+        )
+        wish_known = is_finite(k, C, d)
+        usable_here = usable[k] and known and wish_known
+        alarmed[k], informative[k] = usable_here and broken, usable_here and not broken and not blind
+        K, rank[k] = solve_active(k, unit, unit_b, active, offset, projector)
+        n_active[k], case[k] = K, K if K < 2 else 2 if rank[k] < 2 else 3 if K == 2 else 4
+        solve_motion(k, C, d, wish_known, rank[k], offset, projector, free, G, f)
         if not informative[k]:
             continue
-
-        K = 0
-        for turn in range(len(spread) if turned else 1):
-            for j in range(m):
-                if active[k, j] if paper else near[j]:
-                    angle[K], order[K] = math.atan2(unit[j, 1], unit[j, 0]), turn * m + j
-                    if turned:
-                        angle[K] = (angle[K] + spread[turn] * angles[k, j] + math.pi) % TURN - math.pi
-                    K += 1
-        count = _outward_normals(angle, order, K, generators, around, flat, normals, generator)
-        rows = row_A, row_b, row_source
+        found = find_generators(k, unit, active[k] if paper else near, fan, angle, order)
+        count = outward_normals(angle, order, found, generators, around, normals, generator)
         if paper:
-            kkt = G, f, projector, offset, active
-            _critical_region(k, unit, unit_b, C, d, kkt, normals, generator, count, rank_tolerance, *rows)
+            critical_region(
+                k, unit, unit_b, C, d, G, f, projector, offset, active, normals, generator, count,
+                row_A, row_b, row_source,
+            )  # fmt: skip
         else:
-            _inverse_optimal(k, m, u, ball, C, d, normals, generator, count, generators, *rows)
+            room = ball[min(k, len(ball) - 1)]
+            inverse_optimal(k, m, u, room, C, d, normals, generator, count, generators, row_A, row_b, row_source)
     return (
         (row_A, row_b, row_source),
         (informative, alarmed, slack, excess),
         (G, f, projector, free, offset, active, n_active, rank, case),
-        all_known,
     )

@@ -1,13 +1,15 @@
-r"""Polygons in scalar code: what `clipping` and `polygon` do in torch, one polygon after the other, compiled by numba.
+r"""Polygons cut by half-spaces a.z <= c: the search for the rows that form the ring, one polygon at a time.
 
-Of the rows that some vertex exceeds by more than round-off, the one that cut deepest at first cuts next:
+Of the rows that some vertex exceeds by more than round-off, the one that cut deepest at first cuts next. Let v be the
+vertices, m = min a.v - c, and t the round-off of a.v - c:
 
-    kept vertices  a.v - c <= tolerance: one arc of the ring, closed where the ring crosses the line
-    none kept      EMPTY, if the row provably contradicts the two edges that meet at the vertex nearest to it
-    none strictly  UNDECIDED: the row only touches, it is not used; likewise if nothing is proven
+    m < -2t   the row cuts: the vertices with a.v - c <= t are kept, one arc of the ring, and the arc is closed where
+              the ring crosses the line
+    m > t     every vertex is beyond. EMPTY, if the row provably contradicts the two edges at the nearest vertex
+    else      the row only touches, or nothing is proven. It is moved outward until the nearest vertex is 2t inside,
+              and then it cuts: what is left is an outer sliver. UNDECIDED where -t <= m.
 
-`clipping` is the reference; tests compare the two. Every tolerance is an argument: numba's cache of compiled code does
-not see what changes in another file.
+So no row is ever forgotten, and none is applied tighter than it was given.
 """
 
 from __future__ import annotations
@@ -16,16 +18,15 @@ import math
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
 
-compiled = njit(cache=True, error_model="numpy", nogil=True)  # no_type_check: these must stay plain functions
-# Minima and maxima of finite numbers, in any order.
-ordered = njit(cache=True, error_model="numpy", nogil=True, fastmath={"nnan", "nsz"})
+from torchfsid.kernels.compiled import item, item_of_ordered, launcher
+from torchfsid.outcome import Outcome
+from torchfsid.tolerances import PARALLEL_EDGES, ROUND_OFF
 
-NONEMPTY, UNDECIDED, EMPTY = 0, 1, 2  # `clipping.Outcome`
+NONEMPTY, UNDECIDED, EMPTY = int(Outcome.NONEMPTY), int(Outcome.UNDECIDED), int(Outcome.EMPTY)
 
 
-@ordered
+@item_of_ordered
 @no_type_check
 def _box(vertices, k, n):
     x0 = x1 = vertices[k, 0, 0]
@@ -37,7 +38,7 @@ def _box(vertices, k, n):
     return x0, x1, y0, y1
 
 
-@ordered
+@item_of_ordered
 @no_type_check
 def _beyond(vertices, k, n, p, q, c):
     """How far the vertices reach beyond the line (p, q).z = c."""
@@ -48,136 +49,157 @@ def _beyond(vertices, k, n, p, q, c):
     return most
 
 
-@compiled
+@item
 @no_type_check
-def _any_cuts(vertices, k, n, reach, A, b, tolerance, depth, cutting, epsilon):
-    """Mark the rows that some vertex exceeds by more than round-off; the bounding box spares many of them the loop."""
+def mark_cuts(vertices, k, n, reach, A, b, tolerance, depth, cutting):
+    """Mark the rows that some vertex of polygon k exceeds by more than round-off. The bounding box spares many of them
+    the loop. (Most polygons come no further: the arrays of the batch are indexed, for a view of each would cost more.)
+    """
     x0, x1, y0, y1 = _box(vertices, k, n)
     found = False
     for r in range(b.shape[1]):
         p, q, c = A[k, r, 0], A[k, r, 1], b[k, r]
         cutting[r] = False
         if p * (x1 if p > 0 else x0) + q * (y1 if q > 0 else y0) - c > 0:
-            tolerance[r] = epsilon * (abs(p) * reach[k, 0] + abs(q) * reach[k, 1] + abs(c))
+            tolerance[r] = ROUND_OFF * (abs(p) * reach[k, 0] + abs(q) * reach[k, 1] + abs(c))
             beyond = _beyond(vertices, k, n, p, q, c)
             cutting[r], depth[r] = beyond > tolerance[r], beyond / math.sqrt(p * p + q * q)
             found = found or cutting[r]
     return found
 
 
-@compiled
+@item_of_ordered
 @no_type_check
-def _clip_ring(
-    k, ring, edge, n, A, b, tolerance, depth, cutting, ring_A, ring_b, reach, epsilon, over, spare, spare_edge
-):
-    """Cut the ring of n vertices by the rows marked `cutting`, by their `depth`. Edges are numbered by the slots of
-    `ring_A`, then by the rows.
+def _excess(ring, n, p, q, c, over):
+    """(p, q).v - c of each vertex into `over`; the largest of them."""
+    most = -np.inf
+    for i in range(n):
+        beyond = p * ring[i, 0] + q * ring[i, 1] - c
+        over[i] = beyond
+        most = beyond if beyond > most else most
+    return most
 
-    Returns (n, outcome, shrunk, and for EMPTY the row and the edges that contradict each other).
+
+@item
+@no_type_check
+def cut_ring(ring, edge, n, lines, first_row, reach, tolerance, depth, cutting, over, spare, spare_edge):
+    """Cut the ring of n vertices by the rows marked `cutting`, the deepest first.
+
+    `edge` numbers the lines (p, q, c); row r is line first_row + r. Where a row has to be moved outward, its line is.
+
+    Returns (n, outcome, is the ring smaller; for EMPTY, the three lines that contradict each other).
     """
-    outcome, shrunk, first_row = NONEMPTY, False, ring_A.shape[1]
+    outcome, shrunk = NONEMPTY, False
     while True:
         row = -1
-        for r in range(b.shape[1]):
+        for r in range(len(cutting)):
             if cutting[r] and (row < 0 or depth[r] > depth[row]):
                 row = r
         if row < 0:
             return n, outcome, shrunk, -1, -1, -1
         cutting[row] = False
-        slack, inner, outer = tolerance[row], 0, 0
-        for i in range(n):
-            over[i] = A[k, row, 0] * ring[i, 0] + A[k, row, 1] * ring[i, 1] - b[k, row]
+        line, slack, inner = first_row + row, tolerance[row], 0
+        most = _excess(ring, n, lines[line, 0], lines[line, 1], lines[line, 2], over)
+        if most <= slack:  # an earlier cut has made it redundant
+            continue
+        for i in range(1, n):
             inner = i if over[i] < over[inner] else inner
-            outer = i if over[i] > over[outer] else outer
-        if over[outer] <= slack:  # an earlier cut has made it redundant
-            continue
-        if over[inner] > slack:
-            before, after = edge[_before(inner, n)], edge[inner]
-            first, second = _line(k, before, ring_A, ring_b, A, b), _line(k, after, ring_A, ring_b, A, b)
-            if _contradict((A[k, row, 0], A[k, row, 1], b[k, row]), first, second, reach[k, 0], reach[k, 1], epsilon):
-                return n, EMPTY, False, row, before, after
         if over[inner] >= -slack:
+            before, after = edge[before_in(inner, n)], edge[inner]
+            if over[inner] > slack and _contradict(lines, line, before, after, reach):
+                return n, EMPTY, False, line, before, after
             outcome = UNDECIDED
-            continue
-        first = last = inner
-        while over[_before(first, n)] <= slack:
-            first = _before(first, n)
-        while over[_after(last, n)] <= slack:
-            last = _after(last, n)
-        new, j = 0, first
-        while True:
-            spare[new, 0], spare[new, 1], spare_edge[new] = ring[j, 0], ring[j, 1], edge[j]
-            new += 1
-            if j == last:
-                break
-            j = _after(j, n)
-        if over[last] < -slack:
-            _cross(spare, new, ring, over, last, _after(last, n))
-            new += 1
-        spare_edge[new - 1] = first_row + row
-        if over[first] < -slack:
-            _cross(spare, new, ring, over, first, _before(first, n))
-            spare_edge[new] = edge[_before(first, n)]
-            new += 1
-        n, shrunk = new, True
-        _copy(spare, spare_edge, n, ring, edge)
+        outward = over[inner] + 2 * slack
+        if outward > 0:
+            lines[line, 2] += outward
+            for i in range(n):
+                over[i] -= outward
+            if most - outward <= slack:  # the ring is as narrow as round-off
+                continue
+            slack = 0.0
+        n = _keep_arc(ring, edge, n, line, inner, slack, over, spare, spare_edge)
+        shrunk = True
 
 
-@compiled
+@item
 @no_type_check
-def _line(k, e, ring_A, ring_b, A, b):
-    """The line of an edge, by its number."""
-    V = ring_A.shape[1]
-    if e < V:
-        return ring_A[k, e, 0], ring_A[k, e, 1], ring_b[k, e]
-    return A[k, e - V, 0], A[k, e - V, 1], b[k, e - V]
+def _keep_arc(ring, edge, n, line, inner, slack, over, spare, spare_edge):
+    """The arc around the vertex `inner` with a.v - c <= slack, closed along the line; the number of its vertices."""
+    first = last = inner
+    while over[before_in(first, n)] <= slack:
+        first = before_in(first, n)
+    while over[after_in(last, n)] <= slack:
+        last = after_in(last, n)
+    new, j = 0, first
+    while True:
+        spare[new, 0], spare[new, 1], spare_edge[new] = ring[j, 0], ring[j, 1], edge[j]
+        new += 1
+        if j == last:
+            break
+        j = after_in(j, n)
+    if over[last] < -slack:
+        _cross(spare, new, ring, over, last, after_in(last, n))
+        new += 1
+    spare_edge[new - 1] = line
+    if over[first] < -slack:
+        _cross(spare, new, ring, over, first, before_in(first, n))
+        spare_edge[new] = edge[before_in(first, n)]
+        new += 1
+    copy_ring(spare, spare_edge, new, ring, edge)
+    return new
 
 
-@compiled
+@item
 @no_type_check
-def _contradict(row, first, second, reach_x, reach_y, epsilon):
-    """`clipping._contradict`, of three lines (p, q, c)."""
-    turn = first[0] * second[1] - first[1] * second[0]
-    along = row[0] * first[0] + row[1] * first[1], row[0] * second[0] + row[1] * second[1]
+def _contradict(lines, row, first, second, reach):
+    """Is it proven that no point within `reach` satisfies three lines, of which the first is beyond all vertices and
+    the others are the edges at the nearest vertex?
+
+    The proof is a y >= 0 with y_row = 1 and y'c + |y'A| reach < 0 by more than round-off: the y for which y'A = 0, or,
+    if one edge alone will do, the y for which |y'A| is least.
+    """
+    p, q, c = lines[row, 0], lines[row, 1], lines[row, 2]
+    p1, q1, c1 = lines[first, 0], lines[first, 1], lines[first, 2]
+    p2, q2, c2 = lines[second, 0], lines[second, 1], lines[second, 2]
+    turn = p1 * q2 - q1 * p2
     for proof in range(3):
         y = z = 0.0
         if proof == 0 and turn != 0:
-            y = (second[0] * row[1] - second[1] * row[0]) / turn
-            z = (row[0] * first[1] - row[1] * first[0]) / turn
+            y, z = (p2 * q - q2 * p) / turn, (p * q1 - q * p1) / turn
         elif proof == 1:
-            y = -along[0] / (first[0] * first[0] + first[1] * first[1])
+            y = -(p * p1 + q * q1) / (p1 * p1 + q1 * q1)
         elif proof == 2:
-            z = -along[1] / (second[0] * second[0] + second[1] * second[1])
+            z = -(p * p2 + q * q2) / (p2 * p2 + q2 * q2)
         y, z = max(y, 0.0), max(z, 0.0)
-        p, q = row[0] + y * first[0] + z * second[0], row[1] + y * first[1] + z * second[1]
-        noise = abs(p) * reach_x + abs(q) * reach_y
-        for weight, line in ((1.0, row), (y, first), (z, second)):
-            noise += epsilon * weight * (abs(line[0]) * reach_x + abs(line[1]) * reach_y + abs(line[2]))
-        if row[2] + y * first[2] + z * second[2] < -noise:
+        noise = abs(p + y * p1 + z * p2) * reach[0] + abs(q + y * q1 + z * q2) * reach[1]
+        noise += ROUND_OFF * (abs(p) * reach[0] + abs(q) * reach[1] + abs(c))
+        noise += ROUND_OFF * y * (abs(p1) * reach[0] + abs(q1) * reach[1] + abs(c1))
+        noise += ROUND_OFF * z * (abs(p2) * reach[0] + abs(q2) * reach[1] + abs(c2))
+        if c + y * c1 + z * c2 < -noise:
             return True
     return False
 
 
-@compiled
+@item
 @no_type_check
-def _after(i, n):
+def after_in(i, n):
     return i + 1 if i < n - 1 else 0
 
 
-@compiled
+@item
 @no_type_check
-def _before(i, n):
+def before_in(i, n):
     return i - 1 if i > 0 else n - 1
 
 
-@compiled
+@item
 @no_type_check
-def _copy(spare, spare_edge, n, ring, edge):
+def copy_ring(spare, spare_edge, n, ring, edge):
     for i in range(n):
         ring[i, 0], ring[i, 1], edge[i] = spare[i, 0], spare[i, 1], spare_edge[i]
 
 
-@compiled
+@item
 @no_type_check
 def _cross(points, k, ring, over, inner, outer):
     share = over[inner] / (over[inner] - over[outer])
@@ -185,18 +207,21 @@ def _cross(points, k, ring, over, inner, outer):
         points[k, i] = ring[inner, i] + share * (ring[outer, i] - ring[inner, i])
 
 
-@compiled
+@item
 @no_type_check
-def _merge_ring(ring, edge, n, most, lines, parallel, spare, spare_edge):
-    """Drop the edge whose removal adds least area until `most` are left, or none can be dropped."""
+def merge_ring(ring, edge, n, most, lines, spare, spare_edge):
+    """Drop the edge whose removal adds least area until `most` are left, or none can be dropped.
+
+    Its neighbours are extended until they meet. An edge whose neighbours are parallel cannot be dropped.
+    """
     while n > most:
         best, dropped, cx, cy = np.inf, -1, 0.0, 0.0
         for i in range(n):
-            end = _after(i, n)
-            before, after = edge[_before(i, n)], edge[end]
+            end = after_in(i, n)
+            before, after = edge[before_in(i, n)], edge[end]
             p, q, r, s = lines[before, 0], lines[before, 1], lines[after, 0], lines[after, 1]
             turn = p * s - q * r
-            if turn > parallel * math.sqrt(p * p + q * q) * math.sqrt(r * r + s * s):
+            if turn > PARALLEL_EDGES * math.sqrt(p * p + q * q) * math.sqrt(r * r + s * s):
                 x, y = ring[end, 0] - ring[i, 0], ring[end, 1] - ring[i, 1]
                 extended = (x * r + y * s) / turn
                 added = -extended * (p * x + q * y)
@@ -207,17 +232,18 @@ def _merge_ring(ring, edge, n, most, lines, parallel, spare, spare_edge):
             return n
         old = dropped
         for i in range(n - 1):
-            old = _after(old, n)
+            old = after_in(old, n)
             spare[i, 0], spare[i, 1], spare_edge[i] = ring[old, 0], ring[old, 1], edge[old]
         n -= 1
         spare[0, 0], spare[0, 1] = cx, cy
-        _copy(spare, spare_edge, n, ring, edge)
+        copy_ring(spare, spare_edge, n, ring, edge)
     return n
 
 
-@compiled
+@item
 @no_type_check
-def _area(ring, n):
+def area_of(ring, n):
+    """By the shoelace formula about the first vertex."""
     total = 0.0
     for i in range(1, n - 1):
         p, q = ring[i, 0] - ring[0, 0], ring[i, 1] - ring[0, 1]
@@ -225,98 +251,96 @@ def _area(ring, n):
     return total
 
 
-@compiled
+@launcher
 @no_type_check
-def _widened(polygons, slots):
-    """A copy with room for `slots` vertices; new slots repeat the first vertex and carry padding rows."""
-    vertices, A, b, time, source, count, reach = polygons
-    B, V = b.shape
-    wide_vertices, wide_A, wide_b = np.empty((B, slots, 2)), np.empty((B, slots, 2)), np.empty((B, slots))
-    wide_time, wide_source, wide_count = np.empty((B, slots)), np.empty((B, slots), np.int64), np.empty(B, np.int64)
-    for k in range(B):
-        wide_count[k] = count[k]
-        for i in range(slots):
-            j = i if i < V else 0
-            wide_vertices[k, i, 0], wide_vertices[k, i, 1] = vertices[k, j, 0], vertices[k, j, 1]
-            if i < V:
-                wide_A[k, i, 0], wide_A[k, i, 1], wide_b[k, i] = A[k, i, 0], A[k, i, 1], b[k, i]
-                wide_time[k, i], wide_source[k, i] = time[k, i], source[k, i]
-            else:
-                wide_A[k, i, 0], wide_A[k, i, 1], wide_b[k, i] = 0.0, 0.0, 1.0
-                wide_time[k, i], wide_source[k, i] = np.nan, -1
-    return wide_vertices, wide_A, wide_b, wide_time, wide_source, wide_count, reach
+def clip(polygons, A, b, stamp, source, first_label, most):
+    """Cut all polygons by their rows A (B, R, 2), b and source (B, R), stamped (B,).
 
+    `polygons` are (vertices, A, b, time, source, label, count, reach), as in `Polygon`. New edges are labelled one by
+    one from `first_label` on, `entered` are their rows k R + r; without labels, `first_label` is 0. Polygons with more
+    than `most` edges are merged, or stay as they were if that costs what the cut has gained.
 
-@compiled
-@no_type_check
-def _small(k, ring, edge, n, ring_A, A, most, parallel, lines, spare, spare_edge):
-    """Merge a ring that has more than `most` edges."""
-    V, R = ring_A.shape[1], A.shape[1]
-    for i in range(V):
-        lines[i, 0], lines[i, 1] = ring_A[k, i, 0], ring_A[k, i, 1]
-    for i in range(R):
-        lines[V + i, 0], lines[V + i, 1] = A[k, i, 0], A[k, i, 1]
-    return _merge_ring(ring, edge, n, most, lines, parallel, spare, spare_edge)
-
-
-@compiled
-@no_type_check
-def clip(polygons, A, b, stamp, source, most, epsilon, parallel):
-    """All polygons (vertices, A, b, time, source, count, reach) by their rows A (B, R, 2), b and source (B, R).
-
-    Returns (polygons, outcome, shrunk, contradiction): the same polygons, not copied, if none was cut. Those that have
-    more than `most` edges then are merged, or stay as they were if that costs what the cut has gained.
+    Returns (polygons, outcome, shrunk, entered, contradiction): the same polygons, not copied, if none was cut.
     """
-    vertices, ring_A, ring_b, time, ring_source, count, reach = polygons
+    vertices, ring_A, ring_b, time, ring_source, label, count, reach = polygons
     (B, R), V = b.shape, ring_b.shape[1]
     W = V + R + 1
     tolerance, depth, cutting, over = np.empty(R), np.empty(R), np.empty(R, np.bool_), np.empty(W)
-    ring, spare, lines = np.empty((W, 2)), np.empty((W, 2)), np.empty((W, 2))
+    ring, spare, lines = np.empty((W, 2)), np.empty((W, 2)), np.empty((W, 3))
     edge, spare_edge = np.empty(W, np.int64), np.empty(W, np.int64)
-    result, slots = polygons, 0
-    to_vertices, to_A, to_b, to_time, to_source, to_count, _ = polygons
+    result, slots, new = polygons, 0, 0
+    entered = np.empty(B * R if first_label > 0 else 0, np.int64)
+    to_vertices, to_A, to_b, to_time, to_source, to_label, to_count, _ = polygons
     outcome, shrunk = np.zeros(B, np.int64), np.zeros(B, np.bool_)
     lost_A, lost_b = np.full((B, 3, 2), np.nan), np.full((B, 3), np.nan)
     lost_time, lost_source = np.full((B, 3), np.nan), np.full((B, 3), -1)
     for k in range(B):
         n = count[k]
-        if not _any_cuts(vertices, k, n, reach, A, b, tolerance, depth, cutting, epsilon):
+        if not mark_cuts(vertices, k, n, reach, A, b, tolerance, depth, cutting):
             continue
         for i in range(n):
             ring[i, 0], ring[i, 1], edge[i] = vertices[k, i, 0], vertices[k, i, 1], i
-        n, outcome[k], shrunk[k], row, before, after = _clip_ring(
-            k, ring, edge, n, A, b, tolerance, depth, cutting, ring_A, ring_b, reach, epsilon, over, spare, spare_edge
+            lines[i, 0], lines[i, 1], lines[i, 2] = ring_A[k, i, 0], ring_A[k, i, 1], ring_b[k, i]
+        for r in range(R):
+            if cutting[r]:
+                lines[V + r, 0], lines[V + r, 1], lines[V + r, 2] = A[k, r, 0], A[k, r, 1], b[k, r]
+        n, outcome[k], shrunk[k], row, before, after = cut_ring(
+            ring, edge, n, lines, V, reach[k], tolerance, depth, cutting, over, spare, spare_edge
         )
         if outcome[k] == EMPTY:
-            for i, e in enumerate((V + row, before, after)):
-                if e >= V:
-                    lost_A[k, i, 0], lost_A[k, i, 1], lost_b[k, i] = A[k, e - V, 0], A[k, e - V, 1], b[k, e - V]
-                    lost_time[k, i], lost_source[k, i] = stamp[k], source[k, e - V]
-                else:
-                    lost_A[k, i, 0], lost_A[k, i, 1], lost_b[k, i] = ring_A[k, e, 0], ring_A[k, e, 1], ring_b[k, e]
-                    lost_time[k, i], lost_source[k, i] = time[k, e], ring_source[k, e]
+            for i, e in enumerate((row, before, after)):
+                lost_A[k, i, 0], lost_A[k, i, 1] = lines[e, 0], lines[e, 1]
+                lost_b[k, i] = lines[e, 2]
+                lost_time[k, i] = time[k, e] if e < V else stamp[k]
+                lost_source[k, i] = ring_source[k, e] if e < V else source[k, e - V]
         if shrunk[k] and n > most:
-            n = _small(k, ring, edge, n, ring_A, A, most, parallel, lines, spare, spare_edge)
+            n = merge_ring(ring, edge, n, most, lines, spare, spare_edge)
             # The areas are sums in some order.
-            shrunk[k] = _area(ring, n) <= _area(vertices[k], count[k]) * (1 - epsilon)
+            shrunk[k] = area_of(ring, n) <= area_of(vertices[k], count[k]) * (1 - ROUND_OFF)
         if not shrunk[k]:
             continue
         if n > slots:  # seldom: room grows by eight, and all polygons are copied
             slots = max((n + 7) // 8 * 8, V)
             result = _widened(result, slots)
-            to_vertices, to_A, to_b, to_time, to_source, to_count, _ = result
+            to_vertices, to_A, to_b, to_time, to_source, to_label, to_count, _ = result
         to_count[k] = n
         for i in range(slots):
             j = i if i < n else 0
             to_vertices[k, i, 0], to_vertices[k, i, 1] = ring[j, 0], ring[j, 1]
         for i in range(max(n, count[k])):
-            e = edge[i] if i < n else -1
-            if e >= V:
-                to_A[k, i, 0], to_A[k, i, 1], to_b[k, i] = A[k, e - V, 0], A[k, e - V, 1], b[k, e - V]
-                to_time[k, i], to_source[k, i] = stamp[k], source[k, e - V]
-            elif e >= 0:
-                to_A[k, i, 0], to_A[k, i, 1], to_b[k, i] = ring_A[k, e, 0], ring_A[k, e, 1], ring_b[k, e]
-                to_time[k, i], to_source[k, i] = time[k, e], ring_source[k, e]
+            if i >= n:
+                to_A[k, i, 0], to_A[k, i, 1], to_b[k, i] = 0.0, 0.0, 1.0
+                to_time[k, i], to_source[k, i], to_label[k, i] = np.nan, -1, 0
+                continue
+            e = edge[i]
+            to_A[k, i, 0], to_A[k, i, 1], to_b[k, i] = lines[e, 0], lines[e, 1], lines[e, 2]
+            if e < V:
+                to_time[k, i], to_source[k, i], to_label[k, i] = time[k, e], ring_source[k, e], label[k, e]
             else:
-                to_A[k, i, 0], to_A[k, i, 1], to_b[k, i], to_time[k, i], to_source[k, i] = 0.0, 0.0, 1.0, np.nan, -1
-    return result, outcome, shrunk, (lost_A, lost_b, lost_time, lost_source)
+                to_time[k, i], to_source[k, i] = stamp[k], source[k, e - V]
+                to_label[k, i] = 0
+                if first_label > 0:
+                    to_label[k, i], entered[new] = first_label + new, k * R + e - V
+                    new += 1
+    return result, outcome, shrunk, entered[:new], (lost_A, lost_b, lost_time, lost_source)
+
+
+@launcher
+@no_type_check
+def _widened(polygons, slots):
+    """A copy with room for `slots` vertices; new slots repeat the first vertex and carry padding rows."""
+    vertices, A, b, time, source, label, count, reach = polygons
+    (B, V), wide_count = b.shape, count.copy()
+    wide_vertices, wide_A, wide_b = np.empty((B, slots, 2)), np.empty((B, slots, 2)), np.empty((B, slots))
+    wide_time, wide_source = np.empty((B, slots)), np.empty((B, slots), np.int64)
+    wide_label = np.empty((B, slots), np.int64)
+    for k in range(B):
+        for i in range(V):
+            wide_vertices[k, i, 0], wide_vertices[k, i, 1] = vertices[k, i, 0], vertices[k, i, 1]
+            wide_A[k, i, 0], wide_A[k, i, 1], wide_b[k, i] = A[k, i, 0], A[k, i, 1], b[k, i]
+            wide_time[k, i], wide_source[k, i], wide_label[k, i] = time[k, i], source[k, i], label[k, i]
+        for i in range(V, slots):
+            wide_vertices[k, i, 0], wide_vertices[k, i, 1] = vertices[k, 0, 0], vertices[k, 0, 1]
+            wide_A[k, i, 0], wide_A[k, i, 1], wide_b[k, i] = 0.0, 0.0, 1.0
+            wide_time[k, i], wide_source[k, i], wide_label[k, i] = np.nan, -1, 0
+    return wide_vertices, wide_A, wide_b, wide_time, wide_source, wide_label, wide_count, reach

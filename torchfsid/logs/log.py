@@ -30,6 +30,11 @@ if TYPE_CHECKING:
     from torchfsid.robots.measurement import Measurement
 
 
+LONGEST_STEP = 1e4
+"""Median time between samples above which times are in another unit [s]: nobody records a motion every three hours, and
+stamps in nanoseconds of up to 100 kHz, or in microseconds of up to 100 Hz, are further apart than this."""
+
+
 @dataclass(frozen=True)
 class Log:
     """T times of N bodies. Where something is unknown its entries are zeros, never NaN, and a mask says so.
@@ -183,6 +188,9 @@ def _log_in(table: Table) -> Log:
         raise table.error(i + 1, f"times must not decrease, got {t[i + 1]} after {t[i]}")
     if not (steps > 0).any():
         raise table.error(len(t) - 1, f"the log ends after a single time, t = {t[0]}")
+    step = float(np.median(steps[steps > 0]))
+    if step > LONGEST_STEP:
+        raise table.header_error(f"column 't': the median step is {step:g} s; stamps in nanoseconds? Expected seconds")
     time = np.concatenate([[0], np.cumsum(steps > 0)])
 
     names = table.names("robot")

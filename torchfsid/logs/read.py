@@ -1,4 +1,4 @@
-"""Where logs come from: what a path is, decides how it is read."""
+"""Open a log: the suffix chooses the reader."""
 
 from __future__ import annotations
 

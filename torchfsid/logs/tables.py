@@ -56,6 +56,16 @@ def require_column(table: Table, name: str) -> None:
         raise table.header_error(f"{problem} {name!r}, the header has {reprlib.repr(table.header)}")
 
 
+def checked_names(table: Table, column: str, names: list[str]) -> list[str]:
+    """Raises `LogError` for a name that is empty or holds a NUL, which no terminal and no file name can show."""
+    for name in dict.fromkeys(names):
+        if not name:
+            raise table.error(names.index(name), f"column {column!r} is empty")
+        if "\0" in name:
+            raise table.error(names.index(name), f"column {column!r}: a name with a NUL: {reprlib.repr(name)}")
+    return names
+
+
 class CsvTable:
     """The cells of a CSV file, as text, with the line of the file that each row stands on."""
 
@@ -95,10 +105,7 @@ class CsvTable:
 
     def names(self, column: str) -> list[str]:
         index = self.header.index(column)
-        names = [row[index].strip() for row in self.rows]
-        if "" in names:
-            raise self.error(names.index(""), f"column {column!r} is empty")
-        return names
+        return checked_names(self, column, [row[index].strip() for row in self.rows])
 
     def numbers(self, column: str) -> Float[np.ndarray, "rows"]:
         index = self.header.index(column)
@@ -107,15 +114,20 @@ class CsvTable:
             values = np.fromiter(map(float, cells), dtype=np.float64, count=len(cells))
         except ValueError:
             values = np.array([math.nan])
-        if is_measurable(values).all():
+        if is_measurable(values).all() and _is_plain("".join(cells)):
             return values
         i = next(i for i, cell in enumerate(cells) if not _is_number(cell))
         raise self.error(i, f"column {column!r}: expected {A_NUMBER}, got {reprlib.repr(cells[i])}")
 
 
+def _is_plain(text: str) -> bool:
+    """Python reads 1_0 as ten, and digits of any script: no program that writes logs means that."""
+    return text.isascii() and "_" not in text
+
+
 def _is_number(cell: str) -> bool:
     try:
-        return bool(is_measurable(float(cell)))
+        return _is_plain(cell) and bool(is_measurable(float(cell)))
     except ValueError:
         return False
 
@@ -154,10 +166,7 @@ class ParquetTable:
         cells = self._column(column)
         if not (types.is_string(cells.type) or types.is_large_string(cells.type) or types.is_integer(cells.type)):
             raise self.header_error(f"column {column!r}: expected text or whole numbers, it holds {cells.type}")
-        names = ["" if cell is None else str(cell).strip() for cell in cells.to_pylist()]
-        if "" in names:
-            raise self.error(names.index(""), f"column {column!r} is empty")
-        return names
+        return checked_names(self, column, ["" if cell is None else str(cell).strip() for cell in cells.to_pylist()])
 
     def numbers(self, column: str) -> Float[np.ndarray, "rows"]:
         from pyarrow import float64, types

@@ -15,19 +15,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.observers.set_membership import Reading, SetMembershipObserver
+from torchfsid.identification.evidence import Evidence, ObservationModel, evidence
 from torchfsid.robots.barriers import Barrier
-from torchfsid.robots.bounds import ErrorBounds, NoiseBound
+from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.measurement import Measurement
-from torchfsid.robots.tasks import Affine, Saturation, Task
+from torchfsid.robots.tasks import Task
 from torchfsid.sets.feasible_set import FeasibleSet
 
 RESOLUTION = 1.02
@@ -44,34 +43,17 @@ SHRUNK = 0.9
 
 
 @dataclass(frozen=True)
-class _Evaluated:
-    """A task whose (C, d) are known: it may depend on the time, and a block of samples has many."""
-
-    task: Task
-    affine: Affine
-
-    @property
-    def parameter_names(self) -> tuple[str, ...]:
-        return self.task.parameter_names
-
-    @property
-    def saturation(self) -> Saturation | None:
-        return self.task.saturation
-
-    def __call__(self, measurement: Measurement) -> Affine:
-        return self.affine
-
-    def drift(self, bounds: ErrorBounds, largest: Float[Tensor, "*batch p"]) -> Float[Tensor, "*batch"]:
-        return self.task.drift(bounds, largest)
-
-
-@dataclass(frozen=True)
 class Block:
-    """Some samples of all robots as one batch, sample by sample."""
+    """Some samples of all robots as one measurement, sample by sample."""
 
     times: Float[Tensor, "samples"]
-    task: _Evaluated
     measurement: Measurement
+
+    @classmethod
+    def of(cls, samples: Sequence[Measurement]) -> Block:
+        return cls(
+            torch.tensor([sample.time for sample in samples], dtype=torch.float64), Measurement.concatenate(samples)
+        )
 
     def repeated(self, of_robots: Tensor) -> Tensor:
         """What is known of each robot, for each of its samples."""
@@ -98,11 +80,10 @@ class Consistency:
         position: float = 0.0,
         neighbour_velocity: float = 0.0,
     ):
-        self.barriers, self.prior, self.slack = barriers, prior, slack
+        self.task, self.barriers, self.prior, self.slack = task, barriers, prior, slack
         self.position, self.neighbour_velocity = position, neighbour_velocity
         self.robots = prior.batch_shape[0]
-        blocks = [measurements[k : k + BLOCK] for k in range(0, len(measurements), BLOCK)]
-        self.blocks = [_block(samples, task) for samples in blocks]
+        self.blocks = [Block.of(measurements[k : k + BLOCK]) for k in range(0, len(measurements), BLOCK)]
         self.fastest = max(float(sample.u.norm(dim=-1).max()) for sample in measurements if sample.u is not None)
 
     def smallest_bounds(self, largest: float) -> Float[Tensor, "B"]:
@@ -129,17 +110,17 @@ class Consistency:
         while True:
             before = theta.volume()
             for block in self.blocks:
-                reading = self.read(block, theta, block.repeated(velocity))
+                found = self.read(block, theta, block.repeated(velocity))
                 if self.slack is None:
-                    fits = fits & ~self._by_robot(reading.alarmed).any(0)
-                rows = reading.omega
+                    fits = fits & ~self._by_robot(found.alarmed).any(0)
+                rows = found.omega
                 A, b = self._by_robot(rows.A).transpose(0, 1).flatten(1, 2), self._by_robot(rows.b).transpose(0, 1)
                 narrowed = theta.intersect(Halfspaces(A, b.flatten(1, 2)))
                 fits = fits & ~narrowed.is_empty
                 theta = narrowed.where(~narrowed.is_empty, theta)
                 if not bool((fits & wanted).any()):
                     return theta, fits
-            if self.blocks[0].task.saturation is None or bool((theta.volume() >= SHRUNK * before)[fits & wanted].all()):
+            if self.task.saturation is None or bool((theta.volume() >= SHRUNK * before)[fits & wanted].all()):
                 return theta, fits
 
     def residuals(self, theta: FeasibleSet, largest: float) -> Float[Tensor, "samples B"]:
@@ -159,43 +140,22 @@ class Consistency:
             found.append(self._by_robot(torch.where(possible, high, math.inf).where(says, math.nan)))
         return torch.cat(found)
 
-    def read(self, block: Block, theta: FeasibleSet, velocity: Float[Tensor, "items"]) -> Reading:
+    def read(self, block: Block, theta: FeasibleSet, velocity: Float[Tensor, "items"]) -> Evidence:
         """What a block of samples says, each item with its velocity bound, while Theta is known."""
-        items = block.repeated(torch.arange(self.robots))
-        noise = NoiseBound(
-            velocity,
-            None if self.slack is None else torch.full_like(velocity, self.slack),
-            self.position,
-            self.neighbour_velocity,
-        )
-        return SetMembershipObserver(block.task, self.barriers, theta.select(items), noise=noise).read(
-            block.measurement
-        )
+        slack = None if self.slack is None else torch.full_like(velocity, self.slack)
+        noise = NoiseBound(velocity, slack, self.position, self.neighbour_velocity)
+        return evidence(ObservationModel(self.task, self.barriers, noise=noise), theta, block.measurement)
 
     def _meets(
         self, block: Block, theta: FeasibleSet, velocity: Float[Tensor, "items"]
     ) -> tuple[Bool[Tensor, "items"], Bool[Tensor, "items"]]:
         """Does each sample's set meet Theta, and was the sample measured at all?"""
-        reading = self.read(block, theta, velocity)
+        found = self.read(block, theta, velocity)
         items = block.repeated(torch.arange(self.robots))
-        meets = ~theta.select(items).intersect(reading.omega).is_empty
+        meets = ~theta.select(items).intersect(found.omega).is_empty
         if self.slack is None:
-            meets = meets & ~reading.alarmed
-        return meets, reading.informative | reading.alarmed
+            meets = meets & ~found.alarmed
+        return meets, found.informative | found.alarmed
 
     def _by_robot(self, items: Tensor) -> Tensor:
         return items.unflatten(0, (-1, self.robots))
-
-
-def _block(samples: Sequence[Measurement], task: Task) -> Block:
-    def joined(name: str) -> Any:
-        values = [getattr(sample, name) for sample in samples]
-        return None if values[0] is None else torch.cat(values)
-
-    C, d = zip(*(task(sample) for sample in samples), strict=True)
-    together = {field.name: joined(field.name) for field in fields(Measurement) if field.name != "t"}
-    return Block(
-        times=torch.tensor([sample.t for sample in samples], dtype=torch.float64),
-        task=_Evaluated(task, (torch.cat(C), torch.cat(d))),
-        measurement=Measurement(t=samples[0].t, **together),
-    )

@@ -13,7 +13,8 @@ What can go wrong with data is reported, never raised:
       position afresh, theta's mean stays, its covariance grows by the drift. Holding the last (G, f) instead would feed
       the filter a motion that nobody has observed;
     - the covariance is no longer positive definite (round-off): its eigenvalues, measured in prior and position noise,
-      are raised to `DEFINITE` times the largest. It only grows, so the filter never claims to know more than before.
+      are raised to `DEFINITE` times the largest. It only grows, so the filter never claims to know more than before;
+    - the filter fails (an overflow, a covariance that cannot be factored): it starts again from its prior.
 """
 
 from __future__ import annotations
@@ -33,11 +34,11 @@ from torchfsid.errors import InputError, SolverError
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.identification.active_set import active_set
 from torchfsid.identification.kkt import solve_kkt
+from torchfsid.observers.motions import Array, Motion, ObservedMotion, QpMotion, Wish
 from torchfsid.outcome import FilterStatus
 from torchfsid.robots.barriers import Barrier, controller_failed, stack_barriers
-from torchfsid.robots.controller import solve_safe_qp
 from torchfsid.robots.measurement import Measurement
-from torchfsid.robots.tasks import Saturation, Task
+from torchfsid.robots.tasks import Task
 from torchfsid.tolerances import ACTIVE_TOLERANCE
 
 FLOOR = 1e-8
@@ -46,15 +47,14 @@ FLOOR = 1e-8
 DEFINITE = 1e-13
 """A repaired covariance's smallest eigenvalue over its largest: a little more than a Cholesky factorisation needs."""
 
+FAILURES = (np.linalg.LinAlgError, ArithmeticError, ValueError)
+"""What numpy, scipy and filterpy raise for numbers they cannot work with."""
+
 FARTHEST = 1e100
 """A position beyond this is no measurement [m]: its square would overflow."""
 
 SIGMA_POINTS = {"alpha": 1.0, "beta": 2.0, "kappa": 0.0}
 """No weight is negative, so that a prediction stays positive definite; alpha < 0.1 loses digits to cancellation."""
-
-Array = np.ndarray
-Motion = Callable[[Array], Array]
-"""Velocities (S, n) [m/s] as a function of parameters (S, p)."""
 
 
 @dataclass(frozen=True)
@@ -121,8 +121,10 @@ class ParameterUkf:
         positive = self.position_noise > 0 and self.active_tolerance > 0
         if not (positive and min(noises) >= 0 and math.isfinite(sum(noises))):
             raise InputError("noises", "position_noise > 0, active_tolerance > 0, the others >= 0", noises)
-        self._theta = self.mean.detach().to(torch.float64).numpy().copy()
-        self._covariance = self._scale[:, :, None] ** 2 * np.eye(p)
+        with np.errstate(over="ignore"):  # a spread whose square overflows: such a filter fails, later
+            variances = self._scale[:, :, None] ** 2
+        self._prior = self.mean.detach().to(torch.float64).numpy(), np.where(np.eye(p) > 0, variances, 0.0)
+        self._theta, self._covariance = (values.copy() for values in self._prior)
         self.filters = [None] * len(self.mean)
         self._motions: list[Motion | None] = [None] * len(self.mean)
         self._t = -math.inf
@@ -138,7 +140,8 @@ class ParameterUkf:
     ) -> ParameterUkf:
         """Start from a prior box: its centre, and the standard deviation of a uniform distribution, width/sqrt(12)."""
         lower, upper = lower.to(torch.float64), upper.to(torch.float64)
-        return cls(task, barriers, (lower + upper) / 2, (upper - lower) / math.sqrt(12), **settings)
+        spread = upper / math.sqrt(12) - lower / math.sqrt(12)  # no overflow on the way
+        return cls(task, barriers, lower / 2 + upper / 2, spread, **settings)
 
     def update(self, measurement: Measurement) -> UkfEstimate:
         """Take in one measurement of all robots.
@@ -146,9 +149,10 @@ class ParameterUkf:
         Raises:
             InputError: the measurement has no velocities or another batch, or its time does not increase.
         """
-        t, robots = measurement.t, len(self.mean)
+        robots = len(self.mean)
         if measurement.u is None or measurement.x.ndim != 2 or len(measurement.x) != robots:
             raise InputError("measurement", f"positions and velocities ({robots}, n)", tuple(measurement.x.shape))
+        t = measurement.time
         if not (math.isfinite(t) and t > self._t):
             raise InputError("measurement.t", f"a time after {self._t}", t)
         with torch.no_grad():
@@ -159,7 +163,8 @@ class ParameterUkf:
         dt = t - self._t if math.isfinite(self._t) else 0.0
 
         x = measurement.x.detach().to(torch.float64).numpy()
-        status = [self._update_robot(i, dt, x[i] if seen[i] else None) for i in range(robots)]
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            status = [self._update_robot(i, dt, x[i] if seen[i] else None) for i in range(robots)]
         self._t, self._motions = t, motions
         self.filters = [kalman if motion else None for kalman, motion in zip(self.filters, motions, strict=True)]
         return UkfEstimate(
@@ -184,8 +189,12 @@ class ParameterUkf:
         for i, kalman in enumerate(self.filters):
             if kalman is not None:
                 n = len(kalman.x) - theta.shape[-1]
-                change = np.linalg.solve(kalman.P[n:, n:], corrected[i] - kalman.x[n:])
-                kalman.x = np.concatenate([kalman.x[:n] + kalman.P[:n, n:] @ change, corrected[i]])
+                try:
+                    change = np.linalg.solve(kalman.P[n:, n:], corrected[i] - kalman.x[n:])
+                except FAILURES:  # the position starts afresh
+                    self.filters[i] = None
+                else:
+                    kalman.x = np.concatenate([kalman.x[:n] + kalman.P[:n, n:] @ change, corrected[i]])
         self._theta = corrected
 
     def _read_motions(self, measurement: Measurement) -> list[Motion | None]:
@@ -207,11 +216,11 @@ class ParameterUkf:
         clip = self.task.saturation
         if self.qp_inside:
             items = zip(safe_controls.A, safe_controls.b, C, d, strict=True)
-            moving = [_QpMotion(_Wish(C_i, d_i, clip), Halfspaces(A, b)) for A, b, C_i, d_i in items]
+            moving = [QpMotion(Wish(C_i, d_i, clip), Halfspaces(A, b)) for A, b, C_i, d_i in items]
         else:
             kkt = solve_kkt(safe_controls, active_set(safe_controls, u, self.active_tolerance), C, d)
             items = zip(kkt.free, kkt.offset, C, d, strict=True)
-            moving = [_ObservedMotion(_Wish(C_i, d_i, clip), free, offset) for free, offset, C_i, d_i in items]
+            moving = [ObservedMotion(Wish(C_i, d_i, clip), free, offset) for free, offset, C_i, d_i in items]
         return [motion if readable else None for motion, readable in zip(moving, known, strict=True)]
 
     def _update_robot(self, i: int, dt: float, position: Array | None) -> FilterStatus:
@@ -227,13 +236,24 @@ class ParameterUkf:
                 repaired = _advance(kalman, dt, motion, position, scale)
             except SolverError:
                 pass  # the QP at some sigma point: the motion is not known after all
+            except FAILURES:
+                return self._restart(i, position)
             else:
+                if not (np.isfinite(kalman.x).all() and np.isfinite(kalman.P).all()):
+                    return self._restart(i, position)
                 self._theta[i], self._covariance[i] = kalman.x[n:], kalman.P[n:, n:]
                 return FilterStatus.REPAIRED if repaired else FilterStatus.OK
         if dt > 0:
             self._covariance[i] += np.diag(drift)
         self.filters[i] = None if position is None else self._start(i, position)
         return FilterStatus.PREDICTED
+
+    def _restart(self, i: int, position: Array) -> FilterStatus:
+        """Forget everything but the prior."""
+        mean, covariance = self._prior
+        self._theta[i], self._covariance[i] = mean[i], covariance[i]
+        self.filters[i] = self._start(i, position)
+        return FilterStatus.FAILED
 
     def _start(self, i: int, position: Array) -> UnscentedKalmanFilter:
         """A filter at a first position, which is all that is known about x, and with what is known about theta."""
@@ -247,7 +267,7 @@ class ParameterUkf:
         return kalman
 
 
-# What filterpy works with. Functions and records of this module, not closures, so that an observer can be pickled.
+# What filterpy works with. Functions of this module, not closures, so that an observer can be pickled.
 
 
 class _Filter(UnscentedKalmanFilter):
@@ -255,42 +275,6 @@ class _Filter(UnscentedKalmanFilter):
 
     def compute_process_sigmas(self, dt: float, fx: Callable[..., Array] | None = None, **fx_args: Any) -> None:
         self.sigmas_f = (fx or self.fx)(self.points_fn.sigma_points(self.x, self.P), dt, **fx_args)
-
-
-@dataclass(frozen=True)
-class _Wish:
-    """uhat = C theta + d, clipped if the task says so."""
-
-    C: Float[Tensor, "n p"]
-    d: Float[Tensor, "n"]
-    clip: Saturation | None
-
-    def __call__(self, theta: Array) -> Float[Tensor, "s n"]:
-        wish = torch.from_numpy(theta) @ self.C.T + self.d
-        return wish if self.clip is None else self.clip(wish)
-
-
-@dataclass(frozen=True)
-class _ObservedMotion:
-    """u = (I - P) uhat + A_a^+ b_a, which is G theta + f where nothing is clipped."""
-
-    wish: _Wish
-    free: Float[Tensor, "n n"]
-    offset: Float[Tensor, "n"]
-
-    def __call__(self, theta: Array) -> Array:
-        return (self.wish(theta) @ self.free.T + self.offset).numpy()
-
-
-@dataclass(frozen=True)
-class _QpMotion:
-    """u = argmin |u - uhat|^2 over the safe controls; zero where there are none."""
-
-    wish: _Wish
-    safe_controls: Halfspaces
-
-    def __call__(self, theta: Array) -> Array:
-        return solve_safe_qp(self.safe_controls, self.wish(theta)).u.numpy()
 
 
 def _move(states: Array, dt: float, motion: Motion, n: int) -> Array:

@@ -9,14 +9,16 @@ functions):
 The bracket is the neighbour's share: nothing (`none`, the paper), its velocity now (`current`: one joint QP over the
 team) or one sample ago (`previous`). The paper's row, a = -dx, b = gamma/2 h, is `squared` with alpha(h) = gamma h,
 halved: the same half-space, and nothing here depends on a row's scale.
+
+A row 0.u <= 1 is padding. A barrier answers for itself whatever generic code needs to know of it (`Barrier`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import ClassVar, Literal, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -26,12 +28,26 @@ from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, dot
 from torchfsid.robots.bounds import ErrorBounds, RowErrors
 from torchfsid.robots.measurement import Measurement
+from torchfsid.tolerances import ROUND_OFF
+
+NeighbourVelocity = Literal["none", "current", "previous"]
 
 
 @runtime_checkable
 class Barrier(Protocol):
-    """Rows over the control u. `soft` rows may be violated by their controller (a slack variable), so a violation
-    of theirs is no alarm."""
+    """Rows over the control u.
+
+    Two more answers may be given. A barrier without them is not trusted where they matter: samples are skipped.
+
+        neighbour_velocity          `none`, `current` (one QP decides for the whole team) or `previous`: the velocities
+                                    of other bodies that the rows count. Without it: perhaps `current`.
+        slack_left_out(measurement) (*batch): the least slack that the row of a body without a slot can have at the
+                                    measured control [m/s], given `measurement.left_out`; infinite if bodies have no
+                                    rows, NaN or -inf if nothing is known. Without it: nothing is known.
+
+    Attributes:
+        soft: the controller may violate the rows (it has slack variables), so that a violation is no alarm.
+    """
 
     @property
     def soft(self) -> bool: ...
@@ -50,6 +66,45 @@ class Barrier(Protocol):
 def stack_barriers(barriers: Sequence[Barrier], measurement: Measurement) -> Halfspaces:
     """The safe controls: every barrier's rows, one below the other."""
     return Halfspaces.stack([barrier(measurement) for barrier in barriers])
+
+
+def is_joint(barriers: Sequence[Barrier]) -> bool:
+    """Does one QP decide for the whole team, since some rows count the neighbours' current velocities?"""
+    return any(getattr(barrier, "neighbour_velocity", None) == "current" for barrier in barriers)
+
+
+def row_errors(
+    barriers: Sequence[Barrier], parts: Sequence[Halfspaces], measurement: Measurement, bounds: ErrorBounds
+) -> RowErrors:
+    """How far the barriers' rows (`parts`) may be off. A barrier without an answer may be off in any way."""
+    return RowErrors.stack(
+        [
+            barrier.errors(measurement, bounds) if hasattr(barrier, "errors") else RowErrors.unknown(part.b)
+            for barrier, part in zip(barriers, parts, strict=True)
+        ]
+    )
+
+
+def controller_failed(
+    barriers: Sequence[Barrier], measurement: Measurement, rows: Halfspaces, errors: RowErrors | None = None
+) -> Bool[Tensor, "*batch"]:
+    """Has the controller of each robot found no solution? Then it commands exactly zero, which says nothing.
+
+    A robot's own QP has failed if zero violates one of its `rows`; it may have failed if zero violates one that is off
+    by its `errors`. A joint QP stops the whole team, whichever pair is at odds, so it may have failed whenever nobody
+    moves.
+    """
+    assert measurement.u is not None
+    stopped = (measurement.u == 0).all(-1)
+    if not bool(stopped.any()):
+        return stopped
+    least = torch.zeros_like(rows.b) if errors is None else errors.slack * rows.norms()
+    failed = stopped & (rows.b < least).any(-1)
+    perhaps_joint = any(getattr(barrier, "neighbour_velocity", None) in ("current", None) for barrier in barriers)
+    if perhaps_joint and measurement.body_velocities is not None:
+        others_move = (measurement.present & (measurement.body_velocities != 0).any(-1)).any(-1)
+        failed = failed | (stopped & ~others_move)
+    return failed
 
 
 @dataclass(frozen=True)
@@ -80,7 +135,7 @@ class CollisionAvoidance:
     safety_distance: float | Tensor | None = None
     margin: float | None = None
     distance: Literal["squared", "euclidean"] = "squared"
-    neighbour_velocity: Literal["none", "current", "previous"] = "none"
+    neighbour_velocity: NeighbourVelocity = "none"
     soft: bool = False
 
     def __post_init__(self) -> None:
@@ -91,64 +146,89 @@ class CollisionAvoidance:
 
     def __call__(self, measurement: Measurement) -> Halfspaces:
         present = measurement.present
-        away = measurement.x.unsqueeze(-2) - measurement.bodies
-        # Slots that hold no body get a harmless vector, so that norms and their gradients stay finite.
-        away = away if bool(present.all()) else torch.where(present.unsqueeze(-1), away, 1.0)
+        away = _away(measurement)
         squared_distance = dot(away, away)
-        Ds = self._safety_distance(measurement)
+        Ds = self._safety_distance(measurement.radius, measurement.body_radii)
         if self.distance == "squared":
             h, gradient = squared_distance - Ds**2, 2 * away
-        else:
-            distance = squared_distance.sqrt()
-            h, gradient = distance - Ds, away / distance.unsqueeze(-1)
+        else:  # at the very place of a body the direction is NaN, and so is the row: it is not known
+            apart = squared_distance > 0
+            distance = torch.where(apart, squared_distance, 1.0).sqrt()
+            h = torch.where(apart, distance, 0.0) - Ds
+            gradient = torch.where(apart.unsqueeze(-1), away / distance.unsqueeze(-1), math.nan)
         b = self.class_k(h)
         if self.neighbour_velocity != "none":
             b = b - dot(gradient, self._neighbours(measurement))
         return Halfspaces(-gradient, b).where(present)
 
     def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
-        """With r = |dx| known up to e: the direction up to asin(e/r), the boundary's distance phi(r) =
-        alpha(h)/|dh/dx|, which grows with r, by at most phi(r) - phi(r - e), and u across the turned row by 2
-        sin(angle/2) |u
-        - u_j|.
+        """With r = |dx| known up to e, three things may be off.
+
+        The direction, by asin(e/r): any direction if e >= r. The boundary's distance phi(r) = alpha(h)/|dh/dx|, which
+        grows with r, by at most phi(r) - phi(r - e). And u across the turned row, by 2 sin(angle/2) |u - u_j|.
 
         Raises:
             InputError: class_k.power < 1/2 with squared distances: phi would not be monotone.
         """
-        if self.distance == "squared" and self.class_k.power < 0.5:
-            raise InputError("class_k.power", "at least 1/2 where positions have errors", self.class_k.power)
-        present = measurement.present
-        away = torch.where(present.unsqueeze(-1), measurement.x.unsqueeze(-2) - measurement.bodies, 1.0)
-        r = away.square().sum(-1).sqrt()
+        self._require_monotone("positions have errors")
+        present, away = measurement.present, _away(measurement)
         e = bounds.position.unsqueeze(-1) + bounds.body_position
-        angle = torch.where(e < r, (e / r).clamp(max=1.0).arcsin(), math.pi)
+        squared = dot(away, away)
+        clear = squared > e.square()
+        r = torch.where(clear, squared, 1.0).sqrt()
+        e = torch.where(clear, e, 0.0)
+        angle = torch.where(clear, (e / r).clamp(max=1.0).arcsin(), math.pi)
         motion = torch.zeros_like(away) if measurement.u is None else measurement.u.unsqueeze(-2)
         velocity_error = torch.zeros_like(r)
         if self.neighbour_velocity != "none":
             motion = motion - self._neighbours(measurement)
             velocity_error = bounds.body_velocity
         turned = 2 * (angle / 2).sin() * motion.norm(dim=-1)
-        moved = self._boundary(r, measurement) - self._boundary((r - e).clamp(min=1e-9), measurement)
-        slack = torch.where(e < r, moved, torch.inf) + turned + velocity_error
+        Ds = self._safety_distance(measurement.radius, measurement.body_radii)
+        moved = self._boundary(r, Ds) - self._boundary((r - e).clamp(min=1e-9), Ds)
+        slack = torch.where(clear, moved, math.inf) + turned + velocity_error
         return RowErrors(torch.where(present, angle, 0.0), torch.where(present, slack, 0.0))
+
+    def slack_left_out(self, measurement: Measurement) -> Float[Tensor, "*batch"]:
+        """phi(R) - |u| - V, with R the least distance of a body left out and V their largest speed (0 if the rows do
+        not count it).
+
+        Raises:
+            InputError: class_k.power < 1/2 with squared distances: phi would not be monotone.
+        """
+        self._require_monotone("bodies are left out")
+        left_out, u = measurement.left_out, measurement.u
+        assert left_out is not None
+        assert u is not None
+        Ds = self._safety_distance(measurement.radius, left_out.radius.unsqueeze(-1))
+        largest = Ds.amax(-1) if isinstance(Ds, Tensor) and Ds.ndim > 0 else Ds
+        nearest = torch.where(left_out.distance.isfinite(), left_out.distance, 1.0)
+        phi = self._boundary((nearest * (1 - ROUND_OFF)).clamp(min=1e-9), largest)
+        speed = u.norm(dim=-1)
+        if self.neighbour_velocity != "none":
+            speed = speed + left_out.speed
+        return phi - speed - ROUND_OFF * (phi.abs() + speed)
 
     def labels(self, bodies: Sequence[str]) -> list[str]:
         return [f"avoid {body}" for body in bodies]
 
-    def _boundary(self, r: Tensor, measurement: Measurement) -> Tensor:
+    def _require_monotone(self, where: str) -> None:
+        if self.distance == "squared" and self.class_k.power < 0.5:
+            raise InputError("class_k.power", f"at least 1/2 where {where}", self.class_k.power)
+
+    def _boundary(self, r: Tensor, Ds: Tensor | float) -> Tensor:
         """phi(r): how fast the robot may approach a standing body at distance r [m/s]."""
-        Ds = self._safety_distance(measurement)
         if self.distance == "squared":
             return self.class_k(r**2 - Ds**2) / (2 * r)
         return self.class_k(r - Ds)
 
-    def _safety_distance(self, measurement: Measurement) -> Tensor | float:
+    def _safety_distance(self, radius: Tensor | None, body_radii: Tensor | None) -> Tensor | float:
         if self.margin is None:
             assert self.safety_distance is not None
             return self.safety_distance
-        if measurement.radius is None or measurement.body_radii is None:
+        if radius is None or body_radii is None:
             raise InputError("measurement.radius", "radii, since the barrier is given by a margin", None)
-        return measurement.radius.unsqueeze(-1) + measurement.body_radii + self.margin
+        return radius.unsqueeze(-1) + body_radii + self.margin
 
     def _neighbours(self, measurement: Measurement) -> Tensor:
         current = self.neighbour_velocity == "current"
@@ -158,8 +238,23 @@ class CollisionAvoidance:
         return velocities
 
 
+def _away(measurement: Measurement) -> Float[Tensor, "*batch m n"]:
+    """x - x_j; slots that hold no body get a harmless vector, so that norms and their gradients stay finite."""
+    present, away = measurement.present, measurement.x.unsqueeze(-2) - measurement.bodies
+    return away if bool(present.all()) else torch.where(present.unsqueeze(-1), away, 1.0)
+
+
+class _OfNoBody:
+    """What a barrier answers whose rows do not depend on other bodies."""
+
+    neighbour_velocity: ClassVar[NeighbourVelocity] = "none"
+
+    def slack_left_out(self, measurement: Measurement) -> Float[Tensor, "*batch"]:
+        return torch.full_like(measurement.x[..., 0], math.inf)
+
+
 @dataclass(frozen=True)
-class SpeedBox:
+class SpeedBox(_OfNoBody):
     """|u_i| <= limit_i on every axis [m/s]: 2n rows."""
 
     limit: tuple[float, ...]
@@ -176,14 +271,14 @@ class SpeedBox:
         return _constant(torch.cat([identity, -identity]), limits, measurement)
 
     def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
-        return _exact(2 * len(self.limit), bounds)
+        return RowErrors.none(self(measurement).b)
 
     def labels(self, bodies: Sequence[str]) -> list[str]:
         return [f"speed {sign}{axis}" for sign in "+-" for axis in "xyz"[: len(self.limit)]]
 
 
 @dataclass(frozen=True)
-class SpeedPolygon:
+class SpeedPolygon(_OfNoBody):
     """u inside a regular polygon of circumradius `limit` [m/s], its first side across the first axis: the usual
     approximation of |u| <= limit by u_1 <= limit cos(pi/sides) and its rotations (Robotarium's, with 8 sides)."""
 
@@ -203,14 +298,14 @@ class SpeedPolygon:
         return _constant(normals, torch.full_like(angles, apothem), measurement)
 
     def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
-        return _exact(self.sides, bounds)
+        return RowErrors.none(self(measurement).b)
 
     def labels(self, bodies: Sequence[str]) -> list[str]:
         return [f"speed side {side}" for side in range(self.sides)]
 
 
 @dataclass(frozen=True)
-class Arena:
+class Arena(_OfNoBody):
     """Stay `margin` [m] inside the box [lower, upper] [m]: h is the distance to each wall, +-u_i <= alpha(h)."""
 
     lower: tuple[float, ...]
@@ -241,70 +336,7 @@ class Arena:
         return torch.cat([to_upper, to_lower], dim=-1)
 
 
-@dataclass(frozen=True)
-class AffineBarrier:
-    """Any rows A u <= b: A (m, n) and b (m,), given as tensors or as functions of the measurement.
-
-    `row_errors` says how far they may be off where positions have errors; needed only there.
-    """
-
-    A: Tensor | Callable[[Measurement], Tensor]
-    b: Tensor | Callable[[Measurement], Tensor]
-    names: tuple[str, ...]
-    soft: bool = False
-    row_errors: Callable[[Measurement, ErrorBounds], RowErrors] | None = None
-
-    def __call__(self, measurement: Measurement) -> Halfspaces:
-        A = self.A(measurement) if callable(self.A) else self.A
-        b = self.b(measurement) if callable(self.b) else self.b
-        m, (*batch, n) = len(self.names), measurement.x.shape
-        if A.shape[-2:] != (m, n) or b.shape[-1:] != (m,):
-            expected = f"A (*batch, {m}, {n}) and b (*batch, {m})"
-            raise InputError("AffineBarrier(A, b)", expected, (tuple(A.shape), tuple(b.shape)))
-        return Halfspaces(A.to(torch.float64).expand(*batch, m, n), b.to(torch.float64).expand(*batch, m))
-
-    def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
-        if self.row_errors is not None:
-            return self.row_errors(measurement, bounds)
-        if any(bool((bound > 0).any()) for bound in bounds):
-            raise InputError("AffineBarrier.row_errors", "how far the rows may be off where bodies may be", None)
-        return _exact(len(self.names), bounds)
-
-    def labels(self, bodies: Sequence[str]) -> list[str]:
-        return list(self.names)
-
-
-def is_joint(barriers: Sequence[Barrier]) -> bool:
-    """Does one QP decide for the whole team, since some rows count the neighbours' current velocities?"""
-    return any(isinstance(b, CollisionAvoidance) and b.neighbour_velocity == "current" for b in barriers)
-
-
-def controller_failed(
-    barriers: Sequence[Barrier], measurement: Measurement, rows: Halfspaces
-) -> Bool[Tensor, "*batch"]:
-    """Has the controller of each robot found no solution? Then it commands exactly zero, which says nothing.
-
-    A robot's own QP has failed if zero violates one of its `rows`. A joint QP stops the whole team, whichever pair is
-    at odds, so it may have failed whenever nobody moves.
-    """
-    assert measurement.u is not None
-    stopped = (measurement.u == 0).all(-1)
-    if not bool(stopped.any()):
-        return stopped
-    failed = stopped & (rows.b < 0).any(-1)
-    if is_joint(barriers) and measurement.body_velocities is not None:
-        others_move = (measurement.present & (measurement.body_velocities != 0).any(-1)).any(-1)
-        failed = failed | (stopped & ~others_move)
-    return failed
-
-
 def _constant(A: Tensor, b: Tensor, measurement: Measurement) -> Halfspaces:
     """The same rows for every robot of the batch."""
     batch = measurement.x.shape[:-1]
     return Halfspaces(A.expand(*batch, *A.shape), b.expand(*batch, *b.shape))
-
-
-def _exact(rows: int, bounds: ErrorBounds) -> RowErrors:
-    """Rows that no position moves."""
-    nothing = bounds.position.unsqueeze(-1).expand(*bounds.position.shape, rows) * 0.0
-    return RowErrors(nothing, nothing)

@@ -1,7 +1,14 @@
-"""How wrong what is measured may be: every record of bounds on errors."""
+"""How wrong what is measured may be: every record of bounds on errors.
+
+NoiseBound    declared once, for a whole log: errors of controls, slacks, positions, neighbours' velocities
+ErrorBounds   at one instant: what was declared, and what the measurement itself adds
+RowErrors     what errors of positions come to for the rows of a barrier (`Barrier.errors`)
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -10,11 +17,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchfsid.errors import InputError
+from torchfsid.robots.measurement import Measurement
 
 
 @dataclass(frozen=True)
 class NoiseBound:
-    """Bounds on the errors of what is measured.
+    """Bounds on the errors of what is measured, the same at all times.
 
     Attributes:
         velocity: |u - u*|, of the measured control and of the controller's solver [m/s].
@@ -46,30 +54,57 @@ class NoiseBound:
 
 
 class ErrorBounds(NamedTuple):
-    """Bounds at one instant: on the robots' positions, on those of the bodies [m], on the bodies' velocities [m/s]."""
+    """Bounds on the errors of one measurement.
+
+    Attributes:
+        position: of the robots' positions [m].
+        body_position: of the bodies' positions [m].
+        body_velocity: of the bodies' velocities [m/s].
+    """
 
     position: Float[Tensor, "*batch"]
     body_position: Float[Tensor, "*batch m"]
     body_velocity: Float[Tensor, "*batch m"]
 
+    @classmethod
+    def of(cls, measurement: Measurement, noise: NoiseBound | None) -> ErrorBounds | None:
+        """What is declared plus what the measurement adds; None: positions and the bodies' velocities are exact."""
+        position, velocity = (0.0, 0.0) if noise is None else (noise.position, noise.neighbour_velocity)
+        added = measurement.position_error, measurement.body_position_error, measurement.body_velocity_error
+        if position == velocity == 0 and all(error is None for error in added):
+            return None
+        robots, bodies = torch.zeros_like(measurement.x[..., 0]), torch.zeros_like(measurement.bodies[..., 0])
+        declared = robots + position, bodies + position, bodies + velocity
+        return cls(*(d if a is None else d + a for d, a in zip(declared, added, strict=True)))
+
 
 class RowErrors(NamedTuple):
-    """How far the rows of a barrier may be off: their direction [rad], and what they say of a control's slack [m/s]."""
-
-    angle: Float[Tensor, "*batch m"]
-    slack: Float[Tensor, "*batch m"]
-
-
-class Uncertainty(NamedTuple):
-    """What the bounds come to at one instant, on top of `NoiseBound.velocity` and `.slack`.
+    """How far the rows of a barrier may be off.
 
     Attributes:
-        velocity: more error of the control [m/s].
-        slack: more error of each row's slack [m/s]. angle: error of each row's direction [rad].
-        drift: error of C theta + d [m/s].
+        angle: of their direction [rad]; from pi on, nothing is known of it.
+        slack: how much more slack a row that is active may be measured with [m/s]; infinite: any.
     """
 
-    velocity: Float[Tensor, "*batch"]
-    slack: Float[Tensor, "*batch m"]
     angle: Float[Tensor, "*batch m"]
-    drift: Float[Tensor, "*batch"]
+    slack: Float[Tensor, "*batch m"]
+
+    @classmethod
+    def none(cls, like: Float[Tensor, "*batch m"]) -> RowErrors:
+        """Of rows that are exact."""
+        nothing = torch.zeros_like(like)
+        return cls(nothing, nothing)
+
+    @classmethod
+    def unknown(cls, like: Float[Tensor, "*batch m"]) -> RowErrors:
+        """Of rows of which nothing is known but that they are there."""
+        return cls(torch.full_like(like, math.pi), torch.full_like(like, math.inf))
+
+    @classmethod
+    def stack(cls, parts: Sequence[RowErrors]) -> RowErrors:
+        """Those of several barriers, as their rows are stacked. A number that is NaN is unknown."""
+        angle, slack = (torch.cat(columns, dim=-1) for columns in zip(*parts, strict=True))
+        return cls(
+            torch.where(angle.isnan(), math.pi, angle),
+            torch.where(slack.isnan(), math.inf, slack),
+        )

@@ -3,24 +3,32 @@
 A batch of B robots looks at the same M bodies: slot j is body j for every robot, and a mask says which bodies are there
 and are not the robot itself. So a team of N robots is a batch of N with M = N slots, and no index list is ever needed.
 In a fleet that would be N^2 rows: there each robot has the slots of its M nearest bodies (`neighbours`).
+
+Time is one more number of each robot: the samples of a whole log, concatenated, are one batch.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchfsid.errors import InputError
+from torchfsid.halfspaces import finite
 
 
 class LeftOut(NamedTuple):
-    """Bodies without a slot: none is nearer than `distance` [m] (infinite: there are none), faster than `speed` [m/s]
-    or larger than `radius` [m]; NaN where unknown."""
+    """Bodies without a slot.
+
+    Attributes:
+        distance: none of them is nearer than this [m]; infinite: there are none.
+        speed: none of them is faster than this [m/s]; NaN: unknown.
+        radius: none of them is larger than this [m]; NaN: unknown.
+    """
 
     distance: Float[Tensor, "*batch"]
     speed: Float[Tensor, "*batch"]
@@ -29,10 +37,10 @@ class LeftOut(NamedTuple):
 
 @dataclass(frozen=True)
 class Measurement:
-    """One instant of B robots among M bodies.
+    """One instant of B robots among M bodies, or several instants concatenated.
 
     Attributes:
-        t: time [s].
+        t: time [s]; a tensor where the robots were measured at different times.
         x: positions [m].
         u: commands executed from t on, i.e. velocities [m/s]; None before they are known (the forward model).
         bodies: positions of whatever may have to be avoided [m].
@@ -40,13 +48,13 @@ class Measurement:
         body_velocities: the bodies' velocities at t [m/s]; NaN where unknown.
         previous_body_velocities: their velocities one sample earlier [m/s]; NaN where unknown.
         radius, body_radii: [m], where known.
-        observed: the robot was measured at t (None: all were). Where False, x and u are zeros, never NaN.
+        observed: the robot was measured at t (None: all were). Where False, nobody looks at x and u.
         position_error, body_position_error: bounds on the error of x and of bodies at this instant [m]; None: zero.
         velocity_error, body_velocity_error: likewise of u and of the bodies' velocities [m/s].
         left_out: the bodies without a slot (None: all have one). Samples that they could matter for are not used.
     """
 
-    t: float
+    t: float | Float[Tensor, "*batch"]
     x: Float[Tensor, "*batch n"]
     u: Float[Tensor, "*batch n"] | None
     bodies: Float[Tensor, "*batch m n"]
@@ -117,3 +125,88 @@ class Measurement:
             velocity_error=own(velocity_error),
             body_velocity_error=for_each_robot(velocity_error),
         )
+
+    @property
+    def time(self) -> float:
+        """The one time of all robots [s].
+
+        Raises:
+            InputError: they were measured at different times.
+        """
+        if not isinstance(self.t, Tensor):
+            return self.t
+        times = self.t.detach().flatten()
+        if len(times) == 0 or not bool((times == times[0]).all()):
+            raise InputError("measurement.t", "one time for all robots", f"{len(times.unique())} different times")
+        return float(times[0])
+
+    def select(self, items: Int[Tensor, "k"] | Bool[Tensor, "B"]) -> Measurement:
+        """The robots at these places of a batch (B,); a place may be named more than once."""
+        chosen = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Tensor) and value.ndim > 0:
+                chosen[field.name] = value[items]
+        if self.left_out is not None:
+            chosen["left_out"] = LeftOut(*(bound[items] for bound in self.left_out))
+        return replace(self, **chosen)
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Measurement]) -> Measurement:
+        """Several batches as one, one after the other; the time becomes a tensor.
+
+        What only some of them know is filled up: nobody left out, no error, everybody observed, neighbours' velocities
+        unknown (NaN).
+
+        Raises:
+            InputError: there are none, they have different numbers of slots, or only some have controls or radii.
+        """
+        if len({(part.x.shape[1:], part.bodies.shape[1:]) for part in parts}) != 1 or parts[0].x.ndim != 2:
+            shapes = [(tuple(part.x.shape), tuple(part.bodies.shape)) for part in parts[:3]]
+            raise InputError("parts", "batches (B, n) of robots, all with the same number of slots", shapes)
+
+        def joined(name: str) -> Tensor | None:
+            values = [getattr(part, name) for part in parts]
+            if all(value is None for value in values):
+                return None
+            return torch.cat([_unknown(name, p) if v is None else v for v, p in zip(values, parts, strict=True)])
+
+        names = [field.name for field in fields(cls) if field.name not in ("t", "left_out")]
+        times = [torch.as_tensor(p.t, dtype=torch.float64, device=p.x.device).expand(len(p.x)) for p in parts]
+        left_out = None
+        if any(part.left_out is not None for part in parts):
+            nobody = [part.x.new_tensor([[torch.inf], [0.0], [0.0]]).expand(3, len(part.x)) for part in parts]
+            columns = zip(*(p.left_out or none.unbind() for p, none in zip(parts, nobody, strict=True)), strict=True)
+            left_out = LeftOut(*map(torch.cat, columns))
+        return cls(t=torch.cat(times), left_out=left_out, **{name: joined(name) for name in names})  # type: ignore[arg-type]
+
+    def observed_only(self) -> Measurement:
+        """With zeros for the positions and controls of robots that were not observed, whatever stood there.
+
+        Raises:
+            InputError: there are no controls, or a number of an observed robot is not finite.
+        """
+        if self.u is None:
+            raise InputError("measurement.u", "velocities", None)
+        if finite(self.x, self.u):
+            return self
+        known = self.x.isfinite().all(-1) & self.u.isfinite().all(-1)
+        observed = torch.ones_like(known) if self.observed is None else self.observed
+        if bool((observed & ~known).any()):
+            robot = (observed & ~known).nonzero()[0].tolist()
+            raise InputError(
+                "measurement", "finite positions and velocities of observed robots", f"others, of robot {robot}"
+            )
+        keep = observed.unsqueeze(-1)
+        return replace(self, x=torch.where(keep, self.x, 0.0), u=torch.where(keep, self.u, 0.0))
+
+
+def _unknown(name: str, part: Measurement) -> Tensor:
+    """What stands for a field that a measurement does not have, and another one has."""
+    if name == "observed":
+        return torch.ones_like(part.x[..., 0], dtype=torch.bool)
+    if name.endswith("_error"):
+        return torch.zeros_like(part.bodies[..., 0] if name.startswith("body") else part.x[..., 0])
+    if name.endswith("body_velocities"):
+        return torch.full_like(part.bodies, torch.nan)
+    raise InputError(f"parts.{name}", "in all of the measurements or in none", "in some of them")

@@ -12,14 +12,17 @@ an active row, the rows left out are inactive if
 
     phi(R) - |u| - V > bound.
 
-Bodies beyond a sensing radius are at least that far away: the same rule, with R no more than the radius.
+Each barrier gives this least slack for itself (`slack_left_out`); one that gives none proves nothing. Bodies beyond a
+sensing radius are at least that far away: the same rule, with R no more than the radius.
 """
 
 from __future__ import annotations
 
 import math
+import numbers
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,74 +30,95 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchfsid.errors import InputError
-from torchfsid.robots.barriers import Barrier, CollisionAvoidance
+from torchfsid.robots.barriers import Barrier
 from torchfsid.robots.measurement import LeftOut, Measurement
 
 
 def nearest_bodies(
     t: float,
-    x: Float[Tensor, "bodies n"],
-    u: Float[Tensor, "bodies n"] | None = None,
+    x: Float[Tensor, "bodies n"] | Float[np.ndarray, "bodies n"],
+    u: Float[Tensor, "bodies n"] | Float[np.ndarray, "bodies n"] | None = None,
     *,
     count: int,
     within: float = math.inf,
     robots: Sequence[int] | None = None,
-    previous_u: Float[Tensor, "bodies n"] | None = None,
-    radius: Float[Tensor, "bodies"] | None = None,
+    previous_u: Float[Tensor, "bodies n"] | Float[np.ndarray, "bodies n"] | None = None,
+    radius: Float[Tensor, "bodies"] | Float[np.ndarray, "bodies"] | None = None,
+    seen: Bool[Tensor, "bodies"] | Bool[np.ndarray, "bodies"] | None = None,
+    position_error: Float[Tensor, "bodies"] | Float[np.ndarray, "bodies"] | None = None,
+    velocity_error: Float[Tensor, "bodies"] | Float[np.ndarray, "bodies"] | None = None,
 ) -> Measurement:
-    """The batch of the inferred `robots` (indices; default all), each among its `count` nearest bodies `within` [m].
+    """The batch of the inferred `robots`, each among its `count` nearest bodies `within` a distance [m].
 
     Found by a k-d tree: the cost grows with N log N. `left_out` says what is known of the others.
 
-    Raises:
-        InputError: `x`, `u` are not (bodies, n), a position is not finite, or `count` or `within` is not positive.
-    """
-    from scipy.spatial import KDTree
+    Args:
+        t: time [s].
+        x: positions of all bodies [m].
+        u: their velocities [m/s].
+        count: slots of each robot.
+        within: bodies farther away get no slot [m].
+        robots: indices of the bodies that are inferred; default all.
+        previous_u: velocities one sample earlier [m/s].
+        radius: of the bodies [m].
+        seen: the bodies measured at t (default all); the others are no obstacles, and unobserved if they are robots.
+        position_error: bounds on the errors of `x` [m].
+        velocity_error: bounds on the errors of `u` and `previous_u` [m/s].
 
-    x = torch.as_tensor(x).to(torch.float64)
-    if x.ndim != 2 or not bool(x.isfinite().all()):
-        raise InputError("x", "finite positions (bodies, n)", tuple(x.shape))
-    if u is not None and u.shape != x.shape:
-        raise InputError("u", f"velocities of shape {tuple(x.shape)}", tuple(u.shape))
-    if count < 1 or not within > 0:
-        raise InputError("count, within", "positive", (count, within))
-    places = x.detach().cpu().numpy()
-    robot = np.arange(len(x)) if robots is None else np.asarray(robots, dtype=np.int64)
-    # One more for the robot itself, one more for the nearest body without a slot; missing ones are infinitely far.
-    distance, body = KDTree(places).query(places[robot], k=count + 2)
-    distance[body == robot[:, None]] = -1.0  # the robot itself comes first, also where bodies share its place
-    order = np.argsort(distance, axis=1, kind="stable")[:, 1:]
-    distance, body = np.take_along_axis(distance, order, 1), np.take_along_axis(body, order, 1)
-    there = (distance[:, :count] <= within) & np.isfinite(distance[:, :count])
-    arrays = (distance[:, count], there, np.where(there, body[:, :count], 0), robot)
-    next_one, present, slots, index = (torch.from_numpy(array).to(x.device) for array in arrays)
+    Raises:
+        InputError: an argument has another shape or kind than this, a robot is no body, a position of a body that was
+            seen is not finite, or `count` or `within` is not positive.
+    """
+    x = _numbers("x", x)
+    if x.ndim != 2:
+        raise InputError("x", "positions (bodies, n)", tuple(x.shape))
+    if not isinstance(count, numbers.Integral) or isinstance(count, bool) or count < 1:
+        raise InputError("count", "a positive whole number of slots", count)
+    if not within > 0:
+        raise InputError("within", "a positive distance [m]", within)
+    index = _indices(robots, x)
+    u, previous_u = (_of_bodies(name, v, x.shape, x) for name, v in (("u", u), ("previous_u", previous_u)))
+    sized = {"radius": radius, "position_error": position_error, "velocity_error": velocity_error}
+    radius, position_error, velocity_error = (_of_bodies(name, v, x.shape[:1], x) for name, v in sized.items())
+    was_seen = torch.ones(len(x), dtype=torch.bool, device=x.device) if seen is None else _seen(seen, x)
+    lost = (was_seen & ~x.isfinite().all(-1)).nonzero().flatten().tolist()
+    if lost:
+        raise InputError("x", "finite positions of the bodies seen", f"{x[lost[0]].tolist()} of body {lost[0]}")
+    distance, slots = _nearest(x, index, was_seen, int(count))
+    present = (distance[:, :-1] <= within) & distance[:, :-1].isfinite()
+    slots = torch.where(present, slots[:, :-1], 0)
 
     def own(of_bodies: Tensor | None) -> Tensor | None:
-        return None if of_bodies is None else of_bodies.to(torch.float64)[index]
+        return None if of_bodies is None else of_bodies[index]
 
     def of_slots(of_bodies: Tensor | None) -> Tensor | None:
-        return None if of_bodies is None else of_bodies.to(torch.float64)[slots]
+        return None if of_bodies is None else of_bodies[slots]
 
-    def largest(of_bodies: Tensor | None) -> Float[Tensor, "robots"]:
-        size = x.new_tensor(math.nan) if of_bodies is None else of_bodies.detach().to(torch.float64).max()
-        return size.expand(len(index))
+    def largest(of_bodies: Tensor | None, default: float = math.nan) -> Tensor:
+        there = None if of_bodies is None else of_bodies.detach()[was_seen]
+        return x.new_tensor(default) if there is None or len(there) == 0 else there.max()
 
-    bodies, left_out = of_slots(x), None
-    assert bodies is not None
+    left_out, next_one = None, distance[:, -1]
     if not bool(next_one.isinf().all() & present.all()):
         speeds = [v.norm(dim=-1) for v in (u, previous_u) if v is not None]
-        speed = largest(torch.cat(speeds) if speeds else None)
-        left_out = LeftOut(next_one.clamp(max=within), speed, largest(radius))
+        speed = largest(torch.stack(speeds).amax(0) if speeds else None) + largest(velocity_error, 0.0)
+        away = (next_one.clamp(max=within) - largest(position_error, 0.0)).clamp(min=0.0)
+        left_out = LeftOut(away, speed.expand(len(index)), largest(radius).expand(len(index)))
     return Measurement(
         t=t,
         x=x[index],
         u=own(u),
-        bodies=bodies,
+        bodies=x[slots],
         present=present,
         body_velocities=of_slots(u),
         previous_body_velocities=of_slots(previous_u),
         radius=own(radius),
         body_radii=of_slots(radius),
+        observed=None if seen is None else was_seen[index],
+        position_error=own(position_error),
+        body_position_error=of_slots(position_error),
+        velocity_error=own(velocity_error),
+        body_velocity_error=of_slots(velocity_error),
         left_out=left_out,
     )
 
@@ -105,46 +129,75 @@ def left_out_inactive(
     bound: Float[Tensor, "*#batch"],
     error: Float[Tensor, "*#batch"],
 ) -> Bool[Tensor, "*batch"]:
-    """Are the rows of all bodies without a slot provably inactive? An unknown speed of theirs proves nothing.
+    """Are the rows of all bodies without a slot provably inactive?
 
     Args:
-        bound: the largest slack of an active row [m/s]. error: of the distance to a body [m].
+        bound: the largest slack of an active row [m/s].
+        error: of the distance to a body [m].
 
     Raises:
-        InputError: class_k.power < 1/2 with squared distances: phi would not grow.
+        InputError: a barrier cannot be asked (class_k.power < 1/2 with squared distances: phi would not grow).
     """
-    left_out, u = measurement.left_out, measurement.u
+    left_out = measurement.left_out
     assert left_out is not None
-    assert u is not None
-    inactive = torch.ones_like(left_out.distance, dtype=torch.bool)
-    nearest = (left_out.distance - error).clamp(min=1e-9)
-    somewhere = nearest.isfinite()
-    ahead = torch.zeros_like(measurement.x)
-    ahead[..., 0] = torch.where(somewhere, nearest, 1.0)
-    standing = torch.zeros_like(ahead).unsqueeze(-2)
+    nearer = replace(measurement, left_out=left_out._replace(distance=left_out.distance - error))
+    inactive = left_out.distance.isinf()  # nobody is left out
+    if bool(inactive.all()):
+        return inactive
+    proven = torch.ones_like(inactive)
     for barrier in barriers:
-        if not isinstance(barrier, CollisionAvoidance):
-            continue
-        if barrier.distance == "squared" and barrier.class_k.power < 0.5:
-            raise InputError("class_k.power", "at least 1/2 where bodies are left out", barrier.class_k.power)
-        if isinstance(barrier.safety_distance, Tensor):
-            barrier = replace(barrier, safety_distance=barrier.safety_distance.max())
-        row = barrier(
-            Measurement(
-                t=measurement.t,
-                x=measurement.x,
-                u=u,
-                bodies=(measurement.x + ahead).unsqueeze(-2),
-                present=torch.ones_like(inactive).unsqueeze(-1),
-                body_velocities=standing,
-                previous_body_velocities=standing,
-                radius=measurement.radius,
-                body_radii=left_out.radius.unsqueeze(-1),
-            )
-        )
-        phi = (row.slack(torch.zeros_like(u)) - row.round_off(u)).squeeze(-1)
-        slack = phi - u.norm(dim=-1)
-        if barrier.neighbour_velocity != "none":
-            slack = slack - left_out.speed
-        inactive = inactive & (slack > bound) | ~somewhere
-    return inactive
+        if not hasattr(barrier, "slack_left_out"):
+            return inactive
+        slack: Tensor = barrier.slack_left_out(nearer)  # type: ignore[attr-defined]
+        proven = proven & (slack > bound)
+    return inactive | proven
+
+
+def _numbers(name: str, value: Any) -> Tensor:
+    try:
+        return torch.as_tensor(value).to(torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(name, "an array of numbers", type(value).__name__) from error
+
+
+def _of_bodies(name: str, value: Any, shape: torch.Size, x: Tensor) -> Tensor | None:
+    """A number or vector for each body."""
+    if value is None:
+        return None
+    value = _numbers(name, value).to(x.device)
+    if value.shape != shape:
+        raise InputError(name, f"the shape {tuple(shape)}", tuple(value.shape))
+    if name.endswith("_error") and bool((value < 0).any()):
+        raise InputError(name, "bounds >= 0", value.min().item())
+    return value
+
+
+def _seen(seen: Any, x: Tensor) -> Bool[Tensor, "bodies"]:
+    seen = torch.as_tensor(seen).to(x.device)
+    if seen.dtype != torch.bool or seen.shape != x.shape[:1]:
+        raise InputError("seen", f"booleans of the shape ({len(x)},)", (seen.dtype, tuple(seen.shape)))
+    return seen
+
+
+def _indices(robots: Sequence[int] | None, x: Tensor) -> Tensor:
+    if robots is None:
+        return torch.arange(len(x), device=x.device)
+    for robot in robots:
+        if not isinstance(robot, numbers.Integral) or isinstance(robot, bool) or not 0 <= robot < len(x):
+            raise InputError("robots", f"indices of bodies, 0 to {len(x) - 1}", robot)
+    return torch.tensor([int(robot) for robot in robots], dtype=torch.int64, device=x.device)
+
+
+def _nearest(x: Tensor, index: Tensor, seen: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """The distances [m] and indices of the count + 1 nearest bodies seen, infinitely far where there are no more."""
+    from scipy.spatial import KDTree
+
+    places, robot, shown = x.detach().cpu().numpy(), index.cpu().numpy(), seen.nonzero().flatten().cpu().numpy()
+    here = np.where(np.isin(robot, shown)[:, None], places[robot], 0.0)
+    # One more for the robot itself, one more for the nearest body without a slot; missing ones are infinitely far.
+    distance, found = KDTree(places[shown]).query(here, k=count + 2)
+    body = np.append(shown, -1)[found]
+    distance[body == robot[:, None]] = -1.0  # the robot itself comes first, also where bodies share its place
+    order = np.argsort(distance, axis=1, kind="stable")[:, 1:]
+    nearest = (torch.from_numpy(np.take_along_axis(values, order, 1)).to(x.device) for values in (distance, body))
+    return tuple(nearest)  # type: ignore[return-value]

@@ -1,15 +1,18 @@
-r"""A team of robots in closed loop, sampled: what an observer gets to see, with the truth beside it.
+r"""Robots in closed loop, sampled: what an observer gets to see, with the truth beside it.
 
-    x_i(t + dt) = x_i(t) + dt u_i(t),     u_i(t) = u*(x(t); theta_i)        (G., Eqs. (4), (5), the control held for dt)
+    x_i(t + dt) = x_i(t) + dt (u_i(t) + w_i(t)),     u_i(t) = u*(x(t); theta_i)        (G., Eqs. (4), (5))
 
-All robots compute at the same time, from the positions at t. Every robot avoids every other and the obstacles, which
-stand still. The trajectory is differentiable in theta, start, obstacles, gains and distances.
+The control is held for dt; w is a disturbance, or nothing. All robots compute at the same time, from the positions at
+t. `closed_loop` is this loop, sample by sample, for robots with anything around them. `simulate` runs teams in it:
+every robot avoids every other and the obstacles, which stand still. Both are differentiable in theta, start, the places
+of the bodies, gains and distances.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -25,10 +28,62 @@ STILL = 1e-3
 IDLE = 1e-6
 """... and that nominal speed is above this one [m/s]: below it, it has nowhere to go."""
 
+Surroundings = Callable[[float, Tensor, Tensor], Measurement]
+"""What the robots have around them, as a measurement without controls: (t, x, previous_u) -> measurement.
+
+`t` is the time [s], `x` are the robots' positions [m], `previous_u` their velocities one sample earlier [m/s].
+"""
+
+
+class Sample(NamedTuple):
+    """One instant of a closed loop.
+
+    Attributes:
+        measurement: what the controller saw, with the velocities that the robots executed from then on.
+        control: what the controller decided. Where the QP is infeasible the robot stands still.
+    """
+
+    measurement: Measurement
+    control: Control
+
+    @property
+    def still(self) -> Bool[Tensor, "*batch"]:
+        """The robot stands still though it has somewhere to go."""
+        return stands_still(self.control.u, self.control.nominal)
+
+
+def closed_loop(
+    controller: CbfQpController,
+    theta: Float[Tensor, "*batch p"],
+    start: Float[Tensor, "*batch n"],
+    surroundings: Surroundings,
+    *,
+    dt: float,
+    samples: int,
+    disturbance: Float[Tensor, "samples *batch n"] | None = None,
+) -> Iterator[Sample]:
+    """Run a batch of robots; nothing of the past is kept.
+
+    Args:
+        theta: the robots' parameters.
+        start: their positions at the first sample [m].
+        surroundings: what is around them, asked anew at every sample.
+        dt: time between samples [s].
+        samples: how many there are.
+        disturbance: what is added to the controls [m/s].
+    """
+    x, u = start.to(torch.float64), torch.zeros_like(start, dtype=torch.float64)
+    for k in range(samples):
+        seen = surroundings(k * dt, x, u)
+        control = controller(seen, theta)
+        u = control.u if disturbance is None else control.u + disturbance[k]
+        yield Sample(replace(seen, u=u), control)
+        x = x + dt * u
+
 
 @dataclass(frozen=True)
 class Trajectory:
-    """T samples of N robots, which come first, and K obstacles.
+    """T samples of a team of N robots, which come first, and K obstacles; or of a batch of such teams.
 
     Attributes:
         t: times [s].
@@ -41,26 +96,25 @@ class Trajectory:
     """
 
     t: Float[Tensor, "samples"]
-    x: Float[Tensor, "samples bodies n"]
-    u: Float[Tensor, "samples bodies n"]
-    nominal: Float[Tensor, "samples robots n"]
-    active: Bool[Tensor, "samples robots m"]
-    feasible: Bool[Tensor, "samples robots"]
-    radius: Float[Tensor, "bodies"] | None = None
+    x: Float[Tensor, "samples *teams bodies n"]
+    u: Float[Tensor, "samples *teams bodies n"]
+    nominal: Float[Tensor, "samples *teams robots n"]
+    active: Bool[Tensor, "samples *teams robots m"]
+    feasible: Bool[Tensor, "samples *teams robots"]
+    radius: Float[Tensor, "*#teams bodies"] | None = None
 
     @property
     def robots(self) -> int:
-        return self.nominal.shape[1]
+        return self.nominal.shape[-2]
 
     @property
-    def deadlocked_since(self) -> Float[Tensor, "robots"]:
+    def deadlocked_since(self) -> Float[Tensor, "*teams robots"]:
         """The time from which a robot stands still until the end though it has somewhere to go; NaN if it does not [s].
 
         A robot stopped by an infeasible QP counts too: `feasible` tells the two apart.
         """
         with torch.no_grad():
-            speed, nominal_speed = self.u[:, : self.robots].norm(dim=-1), self.nominal.norm(dim=-1)
-            stuck = (speed <= STILL * nominal_speed) & (nominal_speed > IDLE)
+            stuck = stands_still(self.u[..., : self.robots, :], self.nominal)
             until_the_end = stuck.flip(0).long().cumprod(0).sum(0)
             since = self.t[(len(self.t) - until_the_end).clamp(max=len(self.t) - 1)]
             return torch.where(until_the_end > 0, since, torch.nan)
@@ -68,7 +122,7 @@ class Trajectory:
     def measurement(self, k: int) -> Measurement:
         """What is seen of the robots at sample `k`. Before the first sample, everything stood still."""
         before = torch.zeros_like(self.u[k]) if k == 0 else self.u[k - 1]
-        return _seen(float(self.t[k]), self.x[k], self.u[k], before, self.robots, self.radius)
+        return _of_teams(float(self.t[k]), self.x[k], self.u[k], before, self.robots, self.radius)
 
     def measurements(self) -> Iterator[Measurement]:
         """All samples, in the order of time."""
@@ -77,59 +131,60 @@ class Trajectory:
 
 def simulate(
     controller: CbfQpController,
-    theta: Float[Tensor, "robots p"],
-    start: Float[Tensor, "robots n"],
+    theta: Float[Tensor, "*teams robots p"],
+    start: Float[Tensor, "*teams robots n"],
     *,
     dt: float,
     steps: int,
-    obstacles: Float[Tensor, "obstacles n"] | None = None,
-    radius: Float[Tensor, "bodies"] | None = None,
+    obstacles: Float[Tensor, "*#teams obstacles n"] | None = None,
+    radius: Float[Tensor, "*#teams bodies"] | None = None,
 ) -> Trajectory:
-    """Run the closed loop for `steps` steps of `dt` [s]: steps + 1 samples, the last with its control too.
-
-    Args:
-        theta: the robots' parameters. start: their first positions [m].
-        obstacles: positions of what stands still [m]; their slots come after the robots'.
-        radius: of all bodies, robots first [m]; for barriers given by a margin.
+    """Run a team, or a batch of teams, for `steps` steps: steps + 1 samples, the last with its control too.
 
     Neighbours' velocities are what the barrier says: none, of one sample ago (zero at the first), or current (one QP
-    over the team). A robot whose QP is infeasible stands still for that step, and the run goes on.
+    over the team; one team at a time). A robot whose QP is infeasible stands still for that step, and the run goes on.
+
+    Args:
+        theta: the robots' parameters.
+        start: their first positions [m].
+        dt: length of a step [s].
+        steps: how many.
+        obstacles: positions of what stands still [m]; their slots come after the robots'.
+        radius: of all bodies, robots first [m]; for barriers given by a margin.
 
     Raises:
         InputError: shapes do not fit, positions are not finite, `dt` or `steps` is not positive.
     """
-    if start.ndim != 2 or not bool(start.isfinite().all()):
-        raise InputError("start", "finite positions (robots, n)", start)
-    robots, n = start.shape
+    if start.ndim < 2 or not bool(start.isfinite().all()):
+        raise InputError("start", "finite positions (*teams, robots, n)", start)
+    *teams, robots, n = start.shape
     obstacles = start.new_zeros(0, n) if obstacles is None else obstacles
-    if obstacles.ndim != 2 or obstacles.shape[-1] != n or not bool(obstacles.isfinite().all()):
-        raise InputError("obstacles", f"finite positions (obstacles, {n})", obstacles)
-    bodies = robots + len(obstacles)
-    if theta.ndim != 2 or len(theta) != robots:
-        raise InputError("theta", f"parameters ({robots}, p), one row per robot", tuple(theta.shape))
-    if radius is not None and radius.shape != (bodies,):
-        raise InputError("radius", f"({bodies},), robots first, then obstacles", tuple(radius.shape))
+    if obstacles.ndim < 2 or obstacles.shape[-1] != n or not bool(obstacles.isfinite().all()):
+        raise InputError("obstacles", f"finite positions (*teams, obstacles, {n})", obstacles)
+    bodies = robots + obstacles.shape[-2]
+    if theta.ndim != start.ndim or theta.shape[:-1] != start.shape[:-1]:
+        expected = f"parameters ({', '.join(map(str, (*teams, robots)))}, p), one row per robot"
+        raise InputError("theta", expected, tuple(theta.shape))
+    if radius is not None and radius.shape[-1:] != (bodies,):
+        raise InputError("radius", f"(*teams, {bodies}), robots first, then obstacles", tuple(radius.shape))
     if not (dt > 0 and steps > 0):
         raise InputError("dt, steps", "positive", (dt, steps))
+    try:
+        standing = obstacles.to(torch.float64).expand(*teams, -1, -1)
+    except RuntimeError as error:
+        raise InputError("obstacles", f"teams {tuple(teams)}, or none", tuple(obstacles.shape)) from error
+    at_rest = torch.zeros_like(standing)
 
-    standing = torch.zeros(len(obstacles), n, dtype=torch.float64, device=start.device)
-    x = torch.cat([start, obstacles]).to(torch.float64)
-    u = torch.zeros_like(x)
-    t = dt * torch.arange(steps + 1, dtype=torch.float64, device=start.device)
-    positions: list[Tensor] = []
-    velocities: list[Tensor] = []
-    controls: list[Control] = []
-    for k in range(steps + 1):
-        control = controller(_seen(k * dt, x, None, u, robots, radius), theta)
-        u = torch.cat([control.u, standing])
-        positions.append(x)
-        velocities.append(u)
-        controls.append(control)
-        x = x + dt * u
+    def surroundings(t: float, x: Tensor, previous_u: Tensor) -> Measurement:
+        everywhere, before = torch.cat([x, standing], dim=-2), torch.cat([previous_u, at_rest], dim=-2)
+        return _of_teams(t, everywhere, None, before, robots, radius)
+
+    samples = list(closed_loop(controller, theta, start, surroundings, dt=dt, samples=steps + 1))
+    controls = [sample.control for sample in samples]
     return Trajectory(
-        t=t,
-        x=torch.stack(positions),
-        u=torch.stack(velocities),
+        t=dt * torch.arange(steps + 1, dtype=torch.float64, device=start.device),
+        x=torch.stack([torch.cat([sample.measurement.x, standing], dim=-2) for sample in samples]),
+        u=torch.stack([torch.cat([control.u, at_rest], dim=-2) for control in controls]),
         nominal=torch.stack([control.nominal for control in controls]),
         active=torch.stack([control.active for control in controls]),
         feasible=torch.stack([control.feasible for control in controls]),
@@ -137,5 +192,31 @@ def simulate(
     )
 
 
-def _seen(t: float, x: Tensor, u: Tensor | None, previous_u: Tensor, robots: int, radius: Tensor | None) -> Measurement:
-    return Measurement.of_team(t, x, u, robots=range(robots), previous_u=previous_u, radius=radius)
+def stands_still(u: Float[Tensor, "*batch n"], nominal: Float[Tensor, "*batch n"]) -> Bool[Tensor, "*batch"]:
+    """Does a robot stand still though it has somewhere to go?"""
+    speed = nominal.norm(dim=-1)
+    return (u.norm(dim=-1) <= STILL * speed) & (speed > IDLE)
+
+
+def _of_teams(
+    t: float, x: Tensor, u: Tensor | None, previous_u: Tensor, robots: int, radius: Tensor | None
+) -> Measurement:
+    """What `Measurement.of_team` says of one team whose first bodies are the robots, for a batch of teams."""
+    teams, bodies = x.shape[:-2], x.shape[-2]
+    slot = torch.arange(bodies, device=x.device)
+    radius = None if radius is None else radius.to(torch.float64).expand(*teams, bodies)
+
+    def among(of_bodies: Tensor) -> Tensor:
+        return of_bodies.unsqueeze(len(teams)).expand(*teams, robots, *of_bodies.shape[len(teams) :])
+
+    return Measurement(
+        t=t,
+        x=x[..., :robots, :],
+        u=None if u is None else u[..., :robots, :],
+        bodies=among(x),
+        present=(slot != slot[:robots, None]).expand(*teams, robots, bodies),
+        body_velocities=None if u is None else among(u),
+        previous_body_velocities=among(previous_u),
+        radius=None if radius is None else radius[..., :robots],
+        body_radii=None if radius is None else among(radius),
+    )

@@ -191,10 +191,11 @@ class PatrolTask:
 
     def __call__(self, measurement: Measurement) -> Affine:
         identity = _identity_like(measurement.x)
+        t = torch.as_tensor(measurement.t, dtype=torch.float64, device=identity.device)[..., None, None]
         blocks = [self.gain * identity]
         for k in range(1, self.harmonics + 1):
             w = k * self.rate
-            cos, sin = math.cos(w * measurement.t), math.sin(w * measurement.t)
+            cos, sin = (w * t).cos(), (w * t).sin()
             blocks += [(self.gain * cos - w * sin) * identity, (self.gain * sin + w * cos) * identity]
         return torch.cat(blocks, dim=-1), -self.gain * measurement.x
 
@@ -227,4 +228,5 @@ class AffineTask:
     def drift(self, bounds: ErrorBounds, largest: Tensor) -> Tensor:
         if self.sensitivity is None and bool((bounds.position > 0).any() | (bounds.body_position > 0).any()):
             raise InputError("AffineTask.sensitivity", "how fast C theta + d changes with positions [1/s]", None)
-        return (self.sensitivity or 0.0) * (bounds.position + bounds.body_position.amax(-1))
+        of_bodies = bounds.body_position.amax(-1) if bounds.body_position.shape[-1] else 0.0
+        return (self.sensitivity or 0.0) * (bounds.position + of_bodies)

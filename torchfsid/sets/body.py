@@ -54,9 +54,9 @@ class Body(Protocol):
     """A batch of bounded convex sets {z : A z <= b} in R^p, without redundant rows.
 
     Attributes:
-        A, b: the facets' rows, padded with 0.z <= 1. count: how many are real.
+        A, b: the facets' rows, padded with 0.z <= 1.
+        count: how many of them are real.
         time, source: when and from which constraint each facet came; NaN and `PRIOR` for those it began with.
-        vertices: padded by repeating the first one.
     """
 
     A: Float[Tensor, "B F p"]
@@ -66,7 +66,18 @@ class Body(Protocol):
     count: Int[Tensor, "B"]
 
     @property
-    def vertices(self) -> Float[Tensor, "B V p"]: ...
+    def reach(self) -> Float[Tensor, "B p"]:
+        """The largest |coordinates| that the sets ever had, for round-off is inherited."""
+        ...
+
+    @property
+    def vertices(self) -> Float[Tensor, "B V p"]:
+        """The vertices, padded by repeating the first one."""
+        ...
+
+    def rows(self) -> tuple[Float[Tensor, "B F p"], Float[Tensor, "B F"]]:
+        """A and b with the gradients of the rows that they are."""
+        ...
 
     def select(self, items: Int[Tensor, "k"]) -> Body:
         """The sub-batch at `items`."""
@@ -86,8 +97,9 @@ class Body(Protocol):
     ) -> Clipped:
         """Intersect every body with its R half-spaces A z <= b, stamping new facets with `time` and `source`.
 
-        A body left with more than `most` facets is merged outward; where that costs more than the cut has gained, it
-        stays as it was.
+        A row that only touches a body within round-off is moved outward by that round-off and then applied. A body left
+        with more than `most` facets is merged outward; where that costs more than the cut has gained, it stays as it
+        was.
         """
         ...
 
@@ -103,4 +115,6 @@ class Body(Protocol):
 
     def nearest(
         self, point: Float[Tensor, "B p"], metric: Float[Tensor, "B p p"] | None = None
-    ) -> Float[Tensor, "B p"]: ...
+    ) -> Float[Tensor, "B p"]:
+        """The point of each body nearest to `point`; `metric` is symmetric and positive definite."""
+        ...

@@ -1,11 +1,12 @@
-r"""The faces of a polytope, from its vertices (V) and `incident` (V, F), which says on which facets each of them lies.
+r"""The faces of polytopes, a batch at a time, from `incident` (B, V, F), which says on which facets each vertex lies.
 
 A face is the set of its vertices; its sides are its intersections with facets. Seen from one of its vertices, its apex,
 a face is filled by the pyramids over the sides that the apex is not on, and so on down to the vertices:
 
     vol_k(F) = sum over the sides S of F of dist(apex, S) vol_{k-1}(S) / k.
 
-Taken apart all the way, a facet is a set of simplices (Cohen and Hickey, J. ACM 26, 1979).
+Taken apart all the way, a facet is a set of simplices (Cohen and Hickey, J. ACM 26, 1979). Vertices that are on no
+facet are padding. Vertices are numbered through the batch, vertex v of item i being i V + v; likewise facets.
 """
 
 from __future__ import annotations
@@ -21,10 +22,20 @@ Reals = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
+TABLE = 2**22
+"""Entries (face, vertex, facet) of the tables that are looked at in one go: more polytopes are taken one part after the
+other."""
+
 
 class Level(NamedTuple):
-    """Faces of one dimension, and the pyramids that fill them: over the face `child` of the level below, which lies on
-    `facet`, with the apex of the face `parent` of this level."""
+    """All faces of one dimension, and the pyramids that fill them.
+
+    Attributes:
+        apex: of each face, its apex.
+        parent: of each pyramid, the face that it is a part of.
+        child: of each pyramid, its base, a face of the level below.
+        facet: of each pyramid, the facet that its base lies on.
+    """
 
     apex: Indices
     parent: Indices
@@ -32,11 +43,21 @@ class Level(NamedTuple):
     facet: Indices
 
 
-def pyramids(y: Reals, incident: Mask) -> tuple[float, Reals, Reals]:
-    """Volume, centroid and the areas of the facets."""
-    p, areas = y.shape[1], np.zeros(incident.shape[1])
+def pyramids(y: Reals, incident: Mask) -> tuple[Reals, Reals, Reals]:
+    """Volumes (B,), centroids (B, p) and the areas of the facets (B, F) of polytopes with vertices y (B, V, p)."""
+    (B, _, F), p = incident.shape, y.shape[2]
+    volumes, centroids, areas = np.zeros(B), np.zeros((B, p)), np.zeros((B, F))
+    for some in _parts(incident, p):
+        volumes[some], centroids[some], areas[some] = _pyramids(y[some], incident[some])
+    return volumes, centroids, areas
+
+
+def _pyramids(y: Reals, incident: Mask) -> tuple[Reals, Reals, Reals]:
+    (B, _, F), p = incident.shape, y.shape[2]
     levels, base = _descent(incident, p)
-    volume, centre, plane = np.ones(len(base)), y[base], np.zeros((len(base), 0, p))
+    y, areas = y.reshape(-1, p), np.zeros(B * F)
+    volume: Reals = np.ones(len(base))
+    centre, plane = y[base], np.zeros((len(base), 0, p))
     for k, (apex, parent, child, facet) in enumerate(reversed(levels), start=1):
         if k == p:
             areas[facet] = volume[child]
@@ -44,7 +65,7 @@ def pyramids(y: Reals, incident: Mask) -> tuple[float, Reals, Reals]:
         height = height - ((flat @ height[..., None]).transpose(0, 2, 1) @ flat)[:, 0]
         length = np.linalg.norm(height, axis=1)
         pyramid = length * volume[child] / k
-        volume = np.bincount(parent, pyramid, len(apex))
+        volume = np.asarray(np.bincount(parent, pyramid, len(apex)), dtype=float)
         share = pyramid / np.where(volume > 0, volume, 1.0)[parent] * k / (k + 1)
         arms = share[:, None] * (centre[child] - y[apex[parent]])
         centre = y[apex] + np.stack([np.bincount(parent, arm, len(apex)) for arm in arms.T], axis=1)
@@ -53,11 +74,22 @@ def pyramids(y: Reals, incident: Mask) -> tuple[float, Reals, Reals]:
         plane = np.zeros((len(apex), k, p))
         plane[parent[rising]] = basis[rising]
         base = apex
-    return float(volume[0]), centre[0], areas
+    return volume, centre, areas.reshape(B, F)
 
 
 def simplices(incident: Mask, p: int) -> tuple[Indices, Indices]:
-    """The facets, taken apart: the vertices (S, p) of each simplex, and which facet (S,) it is a part of."""
+    """The facets, taken apart: the vertices (S, p) of each simplex, and the facet (S,) that it is a part of."""
+    (_, V, F), found = incident.shape, []
+    for some in _parts(incident, p):
+        corners, facet = _simplices(incident[some], p)
+        found.append((corners + some.start * V, facet + some.start * F))
+    if not found:
+        return np.zeros((0, p), dtype=np.int64), np.zeros(0, dtype=np.int64)
+    corners, facet = (np.concatenate(part) for part in zip(*found, strict=True))
+    return corners, facet
+
+
+def _simplices(incident: Mask, p: int) -> tuple[Indices, Indices]:
     (top, *levels), base = _descent(incident, p)
     face, facet = top.child, top.facet
     corners = np.zeros((len(face), 0), dtype=np.int64)
@@ -72,38 +104,51 @@ def simplices(incident: Mask, p: int) -> tuple[Indices, Indices]:
 
 
 def bases(rows: Reals, incident: Mask) -> tuple[Indices, Mask]:
-    """For each vertex p of its facets (V, p) that it is the solution of, and whether there are so many (V,).
+    """For each vertex p of its facets (B, V, p) that it is the solution of, and whether there are so many (B, V).
 
-    `rows` (F, p) are the facets' normals, of any length. Where more than p facets meet, the one that is furthest from
-    the span of those taken already is taken next; one within `PARALLEL_ROWS` [rad] of it is none.
+    `rows` (B, F, p) are the facets' normals, of length 1 or 0. Where more than p facets meet, the one that is furthest
+    from the span of those taken already is taken next; one within `PARALLEL_ROWS` [rad] of it is none.
     """
-    V, p = len(incident), rows.shape[1]
-    chosen, enough, at = np.zeros((V, p), dtype=np.int64), np.ones(V, dtype=bool), np.arange(V)
-    left = np.where(incident[..., None], rows / np.linalg.norm(rows, axis=1, keepdims=True), 0.0)
+    (B, V, _), p = incident.shape, rows.shape[2]
+    chosen, enough = np.zeros((B, V, p), dtype=np.int64), np.ones((B, V), dtype=bool)
+    left = np.where(incident[..., None], rows[:, None], 0.0)
     for k in range(p):
         lengths = np.linalg.norm(left, axis=-1)
-        chosen[:, k] = lengths.argmax(1)
-        length = lengths[at, chosen[:, k]]
-        enough &= length > PARALLEL_ROWS
-        along = left[at, chosen[:, k]] / np.where(length > 0, length, 1.0)[:, None]
-        left -= (left @ along[..., None]) * along[:, None]
+        chosen[..., k] = lengths.argmax(-1)
+        length = np.take_along_axis(lengths, chosen[..., k, None], axis=-1)
+        enough &= length[..., 0] > PARALLEL_ROWS
+        along = np.take_along_axis(left, chosen[..., k, None, None], axis=-2)
+        along = along / np.where(length > 0, length, 1.0)[..., None]
+        left -= (left @ along.swapaxes(-1, -2)) * along
     return chosen, enough
 
 
+def _parts(incident: Mask, p: int) -> list[slice]:
+    """The batch in parts, so that no table becomes larger than about `TABLE`; a face has about p sides."""
+    B, V, F = incident.shape
+    size = max(1, TABLE // (p * V * F * F))
+    return [slice(first, min(B, first + size)) for first in range(0, B, size)]
+
+
 def _descent(incident: Mask, p: int) -> tuple[list[Level], Indices]:
-    """From the polytope down to its edges, level by level; below them the vertices."""
-    on = incident.astype(np.float32)
-    faces, levels = np.ones((1, len(incident)), dtype=bool), []
+    """From the polytopes down to their edges, level by level; below them the vertices."""
+    B, V, F = incident.shape
+    on, owner = incident.astype(np.float32), np.arange(B)
+    faces: Mask = np.asarray(incident.any(2))
+    levels: list[Level] = []
     for k in range(p, 0, -1):
         apex = faces.argmax(1)
-        is_side = faces.astype(np.float32) @ on >= k
+        is_side = (faces.astype(np.float32)[:, None] @ on[owner])[:, 0] >= k
         if k < p:  # at the top, the sides at the apex are only wanted for their areas
-            is_side &= ~incident[apex]
+            is_side &= ~incident[owner, apex]
         parent, facet = np.nonzero(is_side)
-        sides = faces[parent] & incident.T[facet]
-        keys = np.packbits(sides, axis=1)  # sorted as strings of bytes: faster than as rows
+        item = owner[parent]
+        sides = faces[parent] & incident[item, :, facet]
+        # Sorted as strings of bytes: faster than as rows.
+        keys = np.column_stack([item.astype(">u4").view(np.uint8).reshape(-1, 4), np.packbits(sides, axis=1)])
+        keys = np.ascontiguousarray(keys)
         _, first, child = np.unique(keys.view(f"S{keys.shape[1]}")[:, 0], return_index=True, return_inverse=True)
         _, once = np.unique(parent * len(first) + child, return_index=True)
-        levels.append(Level(apex, parent[once], child[once], facet[once]))
-        faces = sides[first]
-    return levels, faces.argmax(1)
+        levels.append(Level(apex + owner * V, parent[once], child[once], (facet + item * F)[once]))
+        faces, owner = sides[first], item[first]
+    return levels, faces.argmax(1) + owner * V

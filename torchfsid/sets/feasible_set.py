@@ -3,15 +3,21 @@ r"""The feasible set Theta(t): where the parameter must lie, given everything se
     Theta(t) = Theta_0  intersected with all  Omega(tau), tau <= t          Theta_0 a box, the prior
 
 A set is a value: `intersect` returns the next one. In the plane it is a batch of polygons, elsewhere a batch of
-polytopes; both are differentiable. Its promises: it contains the truth if all half-spaces do; its volume never grows;
-it stays bounded; the order of the half-spaces does not matter; it takes the memory of its facets, of which there are at
-most `max_facets`, merged outward. Each facet remembers when and from which constraint it came.
+polytopes; both are differentiable. Its promises, up to round-off: it contains the truth if all half-spaces do; its
+volume never grows; it stays bounded; the order of the half-spaces does not matter, and a smaller bound never gives a
+larger set; it takes the memory of its facets, of which there are at most `max_facets`, merged outward. Each facet
+remembers when and from which constraint it came.
+
+An EMPTY item says so whatever it is asked: it has volume 0 and contains nothing; its centroid, vertices, diameter,
+support, Chebyshev centre and nearest points are NaN; its radius is minus the depth of the contradiction, the least
+distance by which the rows that contradict each other have to be moved outward. All its gradients are zero.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import nan
 from typing import Any, NamedTuple
 
 import torch
@@ -21,7 +27,7 @@ from torch import Tensor
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, finite
 from torchfsid.outcome import Outcome
-from torchfsid.programmes.differentiable import symmetric
+from torchfsid.programmes.differentiable import inscribed_ball, symmetric
 from torchfsid.sets.polygon import Polygon
 from torchfsid.sets.polytope import Polytope
 from torchfsid.tolerances import ROUND_OFF
@@ -41,8 +47,11 @@ class Facets(NamedTuple):
 class Emptiness(NamedTuple):
     """A three-way answer.
 
-    NONEMPTY comes with a `witness` inside (NaN otherwise), EMPTY with the rows that contradict (NaN otherwise);
-    UNDECIDED says that the half-spaces touch within round-off, and that the set kept is an outer one.
+    Attributes:
+        outcome: an `Outcome` per item. UNDECIDED: some half-space touches the others within round-off, and the set is
+            what they leave if it is moved outward by that round-off.
+        witness: a point inside; NaN unless NONEMPTY.
+        contradiction: the rows that contradict each other; NaN unless EMPTY.
     """
 
     outcome: Int[Tensor, "*batch"]
@@ -55,7 +64,7 @@ class FeasibleSet:
     """A batch of bounded convex sets of parameters. Build it with `from_box`, shrink it with `intersect`.
 
     Attributes:
-        body: the sets, batch flattened: a `Polygon` in the plane, a `Polytope` elsewhere.
+        body: the sets, batch flattened: a `Body`, in the plane a `Polygon`, elsewhere a `Polytope`.
         batch_shape: the batch.
         outcome: an `Outcome` per item; an EMPTY item contains nothing and stays empty, whatever its body.
         contradiction: for EMPTY items the rows that no parameter satisfies together.
@@ -77,13 +86,16 @@ class FeasibleSet:
         """The prior Theta_0 = [lower, upper].
 
         Raises:
-            InputError: shapes differ, or lower < upper fails somewhere, or `max_facets` cannot bound a set.
+            InputError: shapes differ, or lower < upper fails somewhere, or the box is not bounded, or `max_facets`
+                cannot bound a set.
         """
         lower, upper = torch.as_tensor(lower).to(torch.float64), torch.as_tensor(upper).to(torch.float64)
         if lower.shape != upper.shape or lower.ndim == 0:
             raise InputError("lower, upper", "two tensors (*batch, p)", (tuple(lower.shape), tuple(upper.shape)))
         if not bool((lower < upper).all()):
             raise InputError("lower, upper", "lower < upper in every coordinate", (lower.tolist(), upper.tolist()))
+        if not finite(lower, upper):
+            raise InputError("lower, upper", "a bounded box", (lower.tolist(), upper.tolist()))
         batch, p = lower.shape[:-1], lower.shape[-1]
         if max_facets < 2 * p:
             raise InputError("max_facets", f"at least {2 * p}, the facets of the prior box", max_facets)
@@ -123,8 +135,8 @@ class FeasibleSet:
         """The part of the set inside the half-spaces, whose facets are stamped with `time` [s] and the rows' `source`
         (default: 0, 1, ...).
 
-        Rows that only touch the set within round-off are left out (an outer set). If merging facets would cost more
-        than the cut has gained, the set stays as it was.
+        A row that only touches the set within round-off is moved outward by that round-off and then applied (an outer
+        set). If merging facets would cost more than the cut has gained, the set stays as it was.
 
         Raises:
             InputError: dimension or batch do not fit, or a row is NaN or infinite.
@@ -135,6 +147,8 @@ class FeasibleSet:
             raise InputError("halfspaces", expected, (tuple(halfspaces.A.shape), tuple(halfspaces.b.shape)))
         if not finite(halfspaces.A, halfspaces.b):
             raise InputError("halfspaces", "finite rows", "NaN or infinity")
+        if m == 0:
+            return self
         if self.any_empty:
             halfspaces = halfspaces.where(~self.is_empty.unsqueeze(-1))
         source = torch.arange(m, device=self.outcome.device) if halfspaces.source is None else halfspaces.source
@@ -146,17 +160,20 @@ class FeasibleSet:
             self._flat(source, (m,)),
         )
         clipped = self.body.clip(*rows, self.max_facets)
-        body, shrunk = clipped.body, clipped.shrunk
-        if body is self.body and not bool(clipped.outcome.any()):
+        body, decided = clipped.body, not bool(clipped.outcome.any())
+        if body is self.body and decided:
             return self
-        shape, against = self.batch_shape, self.contradiction
-        outcome = torch.maximum(self.outcome, clipped.outcome.reshape(shape))
-        if bool((clipped.outcome == Outcome.EMPTY).any()):
+        shape, outcome, against = self.batch_shape, self.outcome, self.contradiction
+        if not decided:
+            outcome = torch.maximum(outcome, clipped.outcome.reshape(shape))
             found = clipped.contradiction
-            rows = Halfspaces(found.A.reshape(*shape, p + 1, p), found.b.reshape(*shape, p + 1))
-            fresh = Facets(rows, found.time.reshape((*shape, p + 1)), found.source.reshape((*shape, p + 1)))
+            fresh = Facets(
+                Halfspaces(found.A.reshape(*shape, p + 1, p), found.b.reshape(*shape, p + 1)),
+                found.time.reshape((*shape, p + 1)),
+                found.source.reshape((*shape, p + 1)),
+            )
             against = _choose(self.is_empty, against, fresh)
-        last_cut = torch.where(shrunk.reshape(shape), stamp, self.last_cut)
+        last_cut = torch.where(clipped.shrunk.reshape(shape), stamp, self.last_cut)
         return replace(self, body=body, outcome=outcome, contradiction=against, last_cut=last_cut)
 
     def where(self, mask: Bool[Tensor, "*batch"], other: FeasibleSet) -> FeasibleSet:
@@ -189,60 +206,111 @@ class FeasibleSet:
         return Emptiness(self.outcome, torch.where(sure, self.chebyshev()[0], float("nan")), self.contradiction)
 
     def facets(self) -> Facets:
-        """The rows A theta <= b, none redundant beyond round-off, padded; with their time and source."""
-        shape, (A, b) = self.batch_shape, (self.body.A, self.body.b)
+        """The half-spaces that make the set, padded with 0.z <= 1; of an EMPTY item, those of the set before."""
+        A, b = self.body.rows()
         return Facets(
-            Halfspaces(A.reshape(*shape, *A.shape[1:]), b.reshape(*shape, b.shape[-1])),
-            self.body.time.reshape((*shape, b.shape[-1])),
-            self.body.source.reshape((*shape, b.shape[-1])),
+            Halfspaces(self._batched(A), self._batched(b)),
+            self._batched(self.body.time),
+            self._batched(self.body.source),
         )
 
     def contains(self, theta: Float[Tensor, "*batch p"], tolerance: float = 1e-9) -> Bool[Tensor, "*batch"]:
-        """Is theta in the set, up to `tolerance` times its diameter (and round-off)?"""
-        margin = tolerance * self.diameter() + ROUND_OFF * theta.abs().amax(-1)
-        return (self.facets().halfspaces.slack(theta) >= -margin.unsqueeze(-1)).all(-1) & ~self.is_empty
+        """Is theta in the set, up to `tolerance` times its diameter (and round-off)?
+
+        Raises:
+            InputError: theta is not (*batch, p).
+        """
+        self._check("theta", theta, (self.dim,), broadcast=True)
+        with torch.no_grad():
+            round_off = ROUND_OFF * (theta.abs().amax(-1) + 2 * self._batched(self.body.reach).sum(-1))
+            margin = tolerance * self._batched(self.body.diameter()) + round_off
+            inside = self.facets().halfspaces.slack(theta) >= -margin.unsqueeze(-1)
+        return inside.all(-1) & ~self.is_empty
 
     def volume(self) -> Float[Tensor, "*batch"]:
-        """Area in the plane, length in one dimension, volume beyond; 0 for an empty set."""
-        return torch.where(self.is_empty, 0.0, self.body.volume().reshape(self.batch_shape))
+        """Area in the plane, length in one dimension, volume beyond; 0 for an EMPTY item."""
+        return self._unless_empty(self.body.volume(), 0.0)
 
     def vertices(self) -> Float[Tensor, "*batch v p"]:
-        """Vertices (in the plane counter-clockwise), padded by repeating the first one."""
-        return self._batched(self.body.vertices)
+        """Vertices (in the plane counter-clockwise), padded by repeating the first one; NaN for an EMPTY item."""
+        return self._unless_empty(self.body.vertices)
 
     def chebyshev(self) -> tuple[Float[Tensor, "*batch p"], Float[Tensor, "*batch"]]:
-        """Centre and radius of a largest inscribed ball. For elongated sets the centre jumps: see `centroid`."""
+        """Centre and radius of a largest inscribed ball. For elongated sets the centre jumps: see `centroid`.
+
+        The centre of an EMPTY item is NaN, its radius minus the depth of the contradiction.
+        """
         centre, radius = self.body.chebyshev()
-        return self._batched(centre), self._batched(radius)
+        return self._unless_empty(centre), self._unless_empty(radius, -self._depth() if self.any_empty else nan)
 
     def centroid(self) -> Float[Tensor, "*batch p"]:
-        """Centre of volume."""
-        return self._batched(self.body.centroid())
+        """Centre of volume; NaN for an EMPTY item."""
+        return self._unless_empty(self.body.centroid())
 
     def diameter(self) -> Float[Tensor, "*batch"]:
-        """Largest distance between two points of the set."""
-        return self._batched(self.body.diameter())
+        """Largest distance between two points of the set; NaN for an EMPTY item."""
+        return self._unless_empty(self.body.diameter())
 
     def support(self, direction: Float[Tensor, "*batch p"]) -> Float[Tensor, "*batch"]:
-        """Support function h(n) = max n.theta over the set."""
-        flat = direction.to(torch.float64).expand(*self.batch_shape, self.dim).reshape(-1, 1, self.dim)
-        return self._batched(self.body.support(flat).squeeze(-1))
+        """Support function h(n) = max n.theta over the set; NaN for an EMPTY item.
+
+        Raises:
+            InputError: direction is not (*batch, p).
+        """
+        self._check("direction", direction, (self.dim,))
+        flat = self._flat(direction.to(torch.float64), (self.dim,))
+        return self._unless_empty(self.body.support(flat.unsqueeze(1)).squeeze(-1))
 
     def project(
         self, point: Float[Tensor, "*batch p"], metric: Float[Tensor, "*batch p p"] | None = None
     ) -> Float[Tensor, "*batch p"]:
         """The point of the set nearest to `point` in the norm sqrt(z' metric z) (default: Euclidean).
 
+        Only the symmetric part of the metric counts. NaN, with zero gradients, where the metric is not positive
+        definite, where the point or the metric is not finite, and for an EMPTY item.
+
         Raises:
-            InputError: `metric` is not (*batch, p, p).
+            InputError: point is not (*batch, p), or metric is not (*batch, p, p).
         """
         p = self.dim
+        self._check("point", point, (p,))
+        flat = self._flat(point.to(torch.float64), (p,))
+        known = flat.isfinite().all(-1)
         if metric is not None:
-            if metric.shape[-2:] != (p, p):
-                raise InputError("metric", f"(*batch, {p}, {p}), symmetric positive definite", tuple(metric.shape))
-            metric = symmetric(metric.to(torch.float64)).expand(*self.batch_shape, p, p).reshape(-1, p, p)
-        flat = point.to(torch.float64).expand(*self.batch_shape, p).reshape(-1, p)
-        return self._batched(self.body.nearest(flat, metric))
+            self._check("metric", metric, (p, p))
+            metric = self._flat(symmetric(metric.to(torch.float64)), (p, p))
+            known = known & metric.isfinite().all((-1, -2))
+            identity = torch.eye(p, dtype=metric.dtype, device=metric.device)
+            _, fault = torch.linalg.cholesky_ex(torch.where(known[:, None, None], metric, identity).detach())
+            known = known & (fault == 0)
+            metric = torch.where(known[:, None, None], metric, identity)
+        nearest = self.body.nearest(torch.where(known.unsqueeze(-1), flat, 0.0), metric)
+        return self._unless_empty(torch.where(known.unsqueeze(-1), nearest, nan))
+
+    def _depth(self) -> Float[Tensor, "*batch"]:
+        """The depth of the contradictions; NaN where there is none, or none that can be measured."""
+        against = self.contradiction.halfspaces
+        known = ~(against.A.isnan().any(-1) | against.b.isnan())
+        _, radius, _ = inscribed_ball(Halfspaces(against.A, against.b).where(known))
+        return torch.where(radius.detach() < 0, -radius.detach(), nan)
+
+    def _unless_empty(self, flat: Tensor, instead: float | Tensor = nan) -> Tensor:
+        """The answers of all sets, in the shape of the batch; something else for the EMPTY ones."""
+        answer = self._batched(flat)
+        if not self.any_empty:
+            return answer
+        return torch.where(self.is_empty.reshape((*self.batch_shape, *[1] * (flat.ndim - 1))), instead, answer)
+
+    def _check(self, name: str, value: Tensor, shape: tuple[int, ...], broadcast: bool = False) -> None:
+        """Is this one item of a shape for each set, or, with `broadcast`, several?"""
+        batch, inner = value.shape[: value.ndim - len(shape)], tuple(value.shape[value.ndim - len(shape) :])
+        fits = inner == shape and _fits(
+            batch[max(0, len(batch) - len(self.batch_shape)) if broadcast else 0 :], self.batch_shape
+        )
+        if not fits:
+            raise InputError(
+                name, f"(*batch, {', '.join(map(str, shape))}), batch {tuple(self.batch_shape)}", tuple(value.shape)
+            )
 
     def _flat(self, rows: Tensor, shape: tuple[int, ...]) -> Tensor:
         """One item of this shape for each set, the batch flattened."""

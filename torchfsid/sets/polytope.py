@@ -1,39 +1,47 @@
 r"""Batched convex polytopes: the sets of parameters beyond the plane (p = 1, 3, 4, ...), and what is asked of them.
 
-The counterpart of `polygon` and `clipping`, behind the same interface. One polytope is a `Cell`, in numpy, where the
-mathematics is; here they are a batch of padded tensors. Every facet is one of the rows that were given, and carries its
-gradient; where one is required, `sensitivity` has the derivatives of all that is asked, twice. Whatever round-off
-leaves open stays in: every set is an outer set.
+The counterpart of `polygon`, behind the same interface. What has to be found is found in numpy, without gradients:
+which facets are left after a clip in `cell`, volume and centroid in `shape`, the nearest point and the inscribed ball
+in `programmes`. Every facet is one of the rows that were given, and carries its gradient. What follows from the facets
+is differentiable in them, twice. Whatever round-off leaves open stays in: every set is an outer set.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from math import nan
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
 from torch import Tensor
 
-from torchfsid.outcome import Outcome
+from torchfsid.halfspaces import Halfspaces, array
+from torchfsid.outcome import Outcome, ProgrammeStatus
+from torchfsid.programmes.differentiable import inscribed_ball, nearest_point, times
 from torchfsid.sets import sensitivity
 from torchfsid.sets.body import PRIOR, Clipped, Contradiction
-from torchfsid.sets.cell import Cell, box, intersect, nearest, without_cheapest_facet
-from torchfsid.sets.faces import Indices
+from torchfsid.sets.cell import Cell, intersect, merged
+from torchfsid.sets.faces import Indices, Mask, Reals
+from torchfsid.sets.shape import FLAT, Shape
+from torchfsid.tolerances import ROUND_OFF
 
 
 @dataclass(frozen=True)
 class Polytope:
     """A batch of bounded convex polytopes {z : A z <= b} in R^p, float64.
 
-    `count` facets and `vertex_count` vertices are real; behind them stand padding rows 0.z <= 1 and copies of the first
-    vertex. `time` and `source` say when and from which constraint each facet came (NaN and `PRIOR`: the first box).
-    `corners` are the vertices without gradients.
+    Attributes:
+        A, b: the facets' rows, padded with 0.z <= 1. A row that only touched has moved outward by its round-off.
+        time, source: when and from which constraint each facet came; NaN and `PRIOR` for the first box.
+        count: how many facets are real.
+        corners: the vertices, without gradients, padded with copies of the first one.
+        incident: which vertex is on which facet; padding is on none.
+        vertex_count: how many vertices are real.
+        reach: the largest |coordinate| that the set ever had, for round-off is inherited.
     """
 
     A: Float[Tensor, "B F p"]
@@ -44,6 +52,7 @@ class Polytope:
     corners: Float[Tensor, "B V p"]
     incident: Bool[Tensor, "B V F"]
     vertex_count: Int[Tensor, "B"]
+    reach: Float[Tensor, "B p"]
 
     @classmethod
     def from_box(cls, lower: Float[Tensor, "B p"], upper: Float[Tensor, "B p"]) -> Polytope:
@@ -52,7 +61,7 @@ class Polytope:
         unit, b = torch.eye(p, dtype=lower.dtype, device=lower.device), torch.cat([-lower, upper], dim=-1)
         A, nothing = torch.cat([-unit, unit]).expand(B, 2 * p, p), torch.full_like(b, nan)
         rows = _Rows.join((A, b, nothing, torch.full_like(b, PRIOR).long()))
-        boxes = [box(low, high) for low, high in zip(_array(lower), _array(upper), strict=True)]
+        boxes = [Cell.box(low, high) for low, high in zip(array(lower), array(upper), strict=True)]
         return cls._of(boxes, list(np.arange(b.numel()).reshape(b.shape)), rows)
 
     @property
@@ -76,50 +85,6 @@ class Polytope:
             cells[i], origins[i] = cell, origin
         return self._of(cells, origins, _Rows.join(self._rows(), other._rows()))
 
-    def _positions(self, items: Tensor) -> list[int]:
-        return torch.arange(len(self.A), device=items.device)[items].tolist()
-
-    def _rows(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        return self.A, self.b, self.time, self.source
-
-    def _origins(self, first: int = 0) -> list[Indices]:
-        """Where the facets of each item stand among all rows, if the batch's begin with number `first`."""
-        F = self.b.shape[1]
-        return [first + i * F + np.arange(len(cell.b)) for i, cell in enumerate(self._cells)]
-
-    @classmethod
-    def _of(cls, cells: list[Cell], origins: Sequence[Indices], rows: _Rows) -> Polytope:
-        """The batch of these cells, padded to the largest, their facets taken from rows. It keeps the cells, and what
-        is already known about them."""
-        p, device = rows.A.shape[-1], rows.A.device
-        counts = np.array([[len(cell.b), len(cell.vertices)] for cell in cells], dtype=np.int64).reshape(-1, 2)
-        B, (F, V) = len(cells), counts.max(0, initial=1)
-        origin, corners, incident = np.full((B, F), -1), np.zeros((B, V, p)), np.zeros((B, V, F), dtype=bool)
-        for i, (cell, (f, v)) in enumerate(zip(cells, counts, strict=True)):
-            origin[i, :f] = origins[i]
-            corners[i], incident[i, :, :f] = cell.vertices[0], cell.incident[0]
-            corners[i, :v], incident[i, :v, :f] = cell.vertices, cell.incident
-        table = (counts[:, 0], corners, incident, counts[:, 1])
-        facets = rows.at(torch.as_tensor(origin, device=device), 0.0, 1.0)
-        batch = cls(*facets, *(torch.as_tensor(field, device=device) for field in table))
-        batch.__dict__["_cells"] = cells
-        return batch
-
-    @cached_property
-    def _cells(self) -> list[Cell]:
-        """The polytopes one by one, without padding."""
-        A, b, vertices, incident = (_array(field) for field in (self.A, self.b, self.corners, self.incident))
-        counts = zip(self.count.tolist(), self.vertex_count.tolist(), strict=True)
-        return [Cell(A[i, :f], b[i, :f], vertices[i, :v], incident[i, :v, :f]) for i, (f, v) in enumerate(counts)]
-
-    def _stacked(self, rows: list[Any], *shape: int) -> Tensor:
-        return torch.as_tensor(np.array(rows, dtype=float).reshape(len(self.A), *shape), device=self.A.device)
-
-    def _differentiable(self, *others: Tensor) -> bool:
-        """Is a gradient required, with respect to the rows or something else?"""
-        required = any(tensor.requires_grad for tensor in (self.A, self.b, *others))
-        return torch.is_grad_enabled() and required and len(self.A) > 0
-
     def clip(
         self,
         A: Float[Tensor, "B R p"],
@@ -128,30 +93,53 @@ class Polytope:
         source: Int[Tensor, "B R"],
         most: int,
     ) -> Clipped:
-        clipped = clip_polytope(self, A, b, time, source)
-        body, shrunk = _merged(self, clipped.body, clipped.shrunk, most)
-        return replace(clipped, body=body, shrunk=shrunk)
+        (B, R, p), F, device = A.shape, self.b.shape[1], self.A.device
+        cells, origins, against = list(self._cells), self._origins(), np.full((B, p + 1), -1)
+        outcome, shrunk, rows, right = np.full(B, int(Outcome.NONEMPTY)), np.zeros(B, dtype=bool), array(A), array(b)
+        for i in np.flatnonzero(self._exceeded(rows, right)):
+            found = intersect(cells[i], rows[i], right[i])
+            # Among all rows, those of the polytopes come first, item by item.
+            place = np.append(B * F + i * R + np.arange(R), i * F + np.arange(F))
+            outcome[i] = found.outcome
+            against[i, : len(found.contradiction)] = place[found.contradiction]
+            if found.cell is cells[i]:
+                continue
+            cell, kept = merged(found.cell, most)
+            # Merging that costs more than the cut has gained is not worth it.
+            if cell is found.cell or cell.content <= cells[i].content:
+                cells[i], origins[i], shrunk[i] = cell, place[found.origin[kept]], True
+        table = _Rows.join(self._rows(), (A, b, time.unsqueeze(-1).expand(B, R), source))
+        outcomes, cut, conflict = (torch.as_tensor(field, device=device) for field in (outcome, shrunk, against))
+        contradiction = Contradiction(*(field.detach() for field in table.at(conflict, nan, nan)))
+        return Clipped(self._of(cells, origins, table) if shrunk.any() else self, outcomes, cut, contradiction)
+
+    def merge(self, most: int) -> Polytope:
+        """Outer polytopes with at most `most` facets: drop, one by one, the facet whose removal adds the least volume.
+
+        A facet that keeps the set bounded is never dropped, so that more than `most` may remain.
+        """
+        cells, kept = zip(*(merged(cell, most) for cell in self._cells), strict=True)
+        origins = [origin[some] for origin, some in zip(self._origins(), kept, strict=True)]
+        return self._of(list(cells), origins, _Rows.join(self._rows()))
+
+    def rows(self) -> tuple[Float[Tensor, "B F p"], Float[Tensor, "B F"]]:
+        """A and b; each row carries its gradient."""
+        return self.A, self.b
 
     # What is asked of a polytope ------------------------------------------------------------------------------------
 
     @property
     def vertices(self) -> Float[Tensor, "B V p"]:
         """The vertices. Where more than p facets meet, p of them, as different as they come, decide its gradient."""
-        if not self._differentiable():
-            return self.corners
-        return sensitivity.vertices(self.A, self.b, self.corners, self._cells)
+        return sensitivity.vertices(self.A, self.b, self.corners, self.shape) if self._differentiable else self.corners
 
     def volume(self) -> Float[Tensor, "B"]:
-        """Volume (in one dimension, length); 0 for a set whose width is lost in round-off."""
-        if self._differentiable():
-            return sensitivity.measure(self.A, self.b, self._cells)[0]
-        return self._stacked([cell.measure[0] for cell in self._cells])
+        """Volume (in one dimension, length); 0 for a flat set, one whose width is lost in round-off."""
+        return self._measure[0]
 
     def centroid(self) -> Float[Tensor, "B p"]:
-        """Centre of volume; of a set without volume, the middle of its bounding box."""
-        if self._differentiable():
-            return sensitivity.measure(self.A, self.b, self._cells)[1]
-        return self._stacked([cell.measure[1] for cell in self._cells], self.dim)
+        """Centre of volume; of a flat set (a facet, an edge, a point) the centre of that."""
+        return self._measure[1]
 
     def diameter(self) -> Float[Tensor, "B"]:
         """Largest distance between two points of the set."""
@@ -168,28 +156,114 @@ class Polytope:
     def chebyshev(self) -> tuple[Float[Tensor, "B p"], Float[Tensor, "B"]]:
         """Centre and radius of a largest inscribed ball: max r s.t. A_f.z + |A_f| r <= b_f.
 
-        The radius is the distance from the returned centre to the nearest facet. Where the centre is not unique, an end
-        of the set of centres is returned, with the gradient of the p + 1 facets that decide it; the radius and its
-        gradient are right in any case.
+        Where the centre is not unique, the one with the smallest z_1 is returned, among these the one with the smallest
+        z_2, and so on, with the gradient of the p + 1 facets that decide it so. The radius and its gradient are right
+        in any case. A flat set has the radius 0, around a point of it.
         """
-        if self._differentiable():
-            return sensitivity.inscribed_ball(self.A, self.b, self._cells)
-        centres, radii = [cell.ball[0] for cell in self._cells], [cell.ball[1] for cell in self._cells]
-        return self._stacked(centres, self.dim), self._stacked(radii)
+        ball = inscribed_ball(self._recentred)
+        flat = ball.radius <= FLAT * self.reach.amax(-1)
+        centre = self._middle + torch.where(flat.unsqueeze(-1), 0.0, ball.centre)
+        return centre, torch.where(flat, 0.0, ball.radius)
 
     def nearest(
         self, point: Float[Tensor, "B p"], metric: Float[Tensor, "B p p"] | None = None
     ) -> Float[Tensor, "B p"]:
         """The point of the set nearest to `point` in the norm sqrt(z' metric z) (default: Euclidean).
 
-        Raises `SolverError` if a `metric` is not positive definite, or if the solver stalls.
+        NaN where `point` or `metric` is not finite, or `metric` not positive definite.
         """
-        metrics = [np.eye(self.dim)] * len(point) if metric is None else _array(metric)
-        found = [nearest(*each) for each in zip(self._cells, _array(point), metrics, strict=True)]
-        feet = self._stacked([foot for foot, _ in found], self.dim)
-        if not self._differentiable(point, *([] if metric is None else [metric])):
-            return feet
-        return sensitivity.nearest(self.A, self.b, point, metric, feet, [active for _, active in found])
+        rows, point = self._recentred, point - self._middle
+        found = nearest_point(rows, point, metric)
+        lost = found.status == ProgrammeStatus.EMPTY
+        if bool(lost.any()):  # by the round-off of the middle, that of a flat set
+            wider = rows.b + torch.where(lost.unsqueeze(-1), 2 * self._round_off, 0.0)
+            found = nearest_point(Halfspaces(rows.A, wider), point, metric)
+        return self._middle + found.point
+
+    # How it is kept -------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def shape(self) -> Shape:
+        """Without gradients, in numpy."""
+        fields = (self.A, self.b, self.corners, self.vertex_count, self.incident, self.reach)
+        return Shape(*(array(field) for field in fields))
+
+    @cached_property
+    def _cells(self) -> list[Cell]:
+        """The polytopes one by one, without padding."""
+        A, b, vertices, incident, reach = (
+            array(field) for field in (self.A, self.b, self.corners, self.incident, self.reach)
+        )
+        counts = zip(self.count.tolist(), self.vertex_count.tolist(), strict=True)
+        return [
+            Cell(A[i, :f], b[i, :f], vertices[i, :v], incident[i, :v, :f], reach[i]) for i, (f, v) in enumerate(counts)
+        ]
+
+    @property
+    def _differentiable(self) -> bool:
+        """Is a gradient required with respect to the rows?"""
+        return torch.is_grad_enabled() and (self.A.requires_grad or self.b.requires_grad)
+
+    @property
+    def _measure(self) -> tuple[Tensor, Tensor]:
+        """Volume and centroid."""
+        if self._differentiable:
+            return sensitivity.measure(self.A, self.b, self.shape)
+        return self._as_tensor(self.shape.volume), self._as_tensor(self.shape.centroid)
+
+    @property
+    def _middle(self) -> Float[Tensor, "B p"]:
+        """A point of the set, without gradients."""
+        return self._as_tensor(self.shape.middle)
+
+    @property
+    def _recentred(self) -> Halfspaces:
+        """The set with its middle moved to the origin, so that round-off is that of its size."""
+        return Halfspaces(self.A, self.b - times(self.A, self._middle))
+
+    @property
+    def _round_off(self) -> Float[Tensor, "B F"]:
+        """Round-off of A z - b over the set."""
+        return (ROUND_OFF * (times(self.A.abs(), self.reach) + self.b.abs())).detach()
+
+    def _as_tensor(self, field: Reals) -> Tensor:
+        return torch.as_tensor(field, device=self.A.device)
+
+    def _exceeded(self, A: Reals, b: Reals) -> Mask:
+        """(B,), does some row (B, R, p) cut by more than round-off?"""
+        tolerance = ROUND_OFF * ((np.abs(A) @ array(self.reach)[..., None])[..., 0] + np.abs(b))
+        return ((A @ array(self.corners).swapaxes(1, 2)).max(-1) - b > tolerance).any(-1)
+
+    def _positions(self, items: Tensor) -> list[int]:
+        return torch.arange(len(self.A), device=items.device)[items].tolist()
+
+    def _rows(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return self.A, self.b, self.time, self.source
+
+    def _origins(self, first: int = 0) -> list[Indices]:
+        """Where the facets of each item stand among all rows, if the batch's begin with number `first`."""
+        F = self.b.shape[1]
+        return [first + i * F + np.arange(len(cell.b)) for i, cell in enumerate(self._cells)]
+
+    @classmethod
+    def _of(cls, cells: list[Cell], origins: Sequence[Indices], rows: _Rows) -> Polytope:
+        """The batch of these cells, padded to the largest. Their facets are taken from `rows`, with their gradients;
+        their numbers b from the cells, where some have been moved outward."""
+        p, device = rows.A.shape[-1], rows.A.device
+        counts = np.array([[len(cell.b), len(cell.vertices)] for cell in cells], dtype=np.int64).reshape(-1, 2)
+        B, (F, V) = len(cells), np.maximum(counts.max(0, initial=1), (1, p))
+        origin, right = np.full((B, F), -1), np.ones((B, F))
+        corners, incident, reach = np.zeros((B, V, p)), np.zeros((B, V, F), dtype=bool), np.zeros((B, p))
+        for i, (cell, (f, v)) in enumerate(zip(cells, counts, strict=True)):
+            origin[i, :f], right[i, :f] = origins[i], cell.b
+            corners[i], corners[i, :v], incident[i, :v, :f] = cell.vertices[0], cell.vertices, cell.incident
+            reach[i] = cell.reach
+        A, b, time, source = rows.at(torch.as_tensor(origin, device=device), 0.0, 1.0)
+        b = b + (torch.as_tensor(right, device=device) - b).detach()
+        table = (counts[:, 0], corners, incident, counts[:, 1], reach)
+        batch = cls(A, b, time, source, *(torch.as_tensor(field, device=device) for field in table))
+        batch.__dict__["_cells"] = cells
+        return batch
 
 
 class _Rows(NamedTuple):
@@ -205,67 +279,12 @@ class _Rows(NamedTuple):
         """Of each batch, A (B, R, p), b, time and source (B, R), item by item."""
         return cls(*(torch.cat([field.flatten(0, 1) for field in fields]) for fields in zip(*batches, strict=True)))
 
-    def at(self, index: Int[Tensor, "B K"], of_A: float, of_b: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The rows at these places; where the index is -1, A and b are what is given, of the prior."""
+    def at(self, index: Int[Tensor, "B K"], fill_A: float, fill_b: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The rows at these places; where the index is -1, A and b are filled in, of the prior."""
         none = index < 0
         return (
-            torch.where(none.unsqueeze(-1), of_A, self.A[index]),
-            torch.where(none, of_b, self.b[index]),
+            torch.where(none.unsqueeze(-1), fill_A, self.A[index]),
+            torch.where(none, fill_b, self.b[index]),
             torch.where(none, nan, self.time[index]),
             torch.where(none, PRIOR, self.source[index]),
         )
-
-
-def clip_polytope(
-    polytope: Polytope,
-    A: Float[Tensor, "B R p"],
-    b: Float[Tensor, "B R"],
-    time: Float[Tensor, "B"],
-    source: Int[Tensor, "B R"],
-) -> Clipped:
-    """Intersect every polytope with its R half-spaces A z <= b, stamping new facets with `time` and `source`."""
-    (B, R, p), F, device = A.shape, polytope.b.shape[1], polytope.A.device
-    cells, outcome, shrunk = list(polytope._cells), np.full(B, int(Outcome.NONEMPTY)), np.zeros(B, dtype=bool)
-    origins, against = [], np.full((B, p + 1), -1)
-    for i, item in enumerate(zip(cells, _array(A), _array(b), strict=True)):
-        found = intersect(*item)
-        cells[i], outcome[i], shrunk[i] = found.cell, found.outcome, found.cell is not item[0]
-        # Among all rows, those of the polytopes come first, item by item.
-        place = np.append(B * F + i * R + np.arange(R), i * F + np.arange(F))
-        origins.append(place[found.origin])
-        against[i, : len(found.contradiction)] = place[found.contradiction]
-    outcomes, cut, conflict = (torch.as_tensor(table, device=device) for table in (outcome, shrunk, against))
-    rows = _Rows.join(polytope._rows(), (A, b, time.unsqueeze(-1).expand(B, R), source))
-    body = Polytope._of(cells, origins, rows) if shrunk.any() else polytope
-    contradiction = Contradiction(*(field.detach() for field in rows.at(conflict, nan, nan)))
-    return Clipped(body, outcomes, cut, contradiction)
-
-
-def merge_polytope(polytope: Polytope, most: int) -> Polytope:
-    """Outer polytopes with at most `most` facets: drop, one by one, the facet whose removal adds the least volume.
-
-    A facet that keeps the set bounded is never dropped, so that more than `most` may remain.
-    """
-    cells, origins = list(polytope._cells), polytope._origins()
-    for i, cell in enumerate(cells):
-        while len(cell.b) > most and (larger := without_cheapest_facet(cell)) is not None:
-            cell, kept = larger
-            cells[i], origins[i] = cell, origins[i][kept]
-    return Polytope._of(cells, origins, _Rows.join(polytope._rows()))
-
-
-def _merged(
-    before: Polytope, body: Polytope, shrunk: Bool[Tensor, "B"], most: int
-) -> tuple[Polytope, Bool[Tensor, "B"]]:
-    """With at most `most` facets, or as before where merging would cost more than the cut has gained."""
-    over = (body.count > most).nonzero().squeeze(-1)
-    if len(over) == 0:
-        return body, shrunk
-    merged = merge_polytope(body.select(over), most)
-    grown = merged.volume() > before.select(over).volume()
-    body = body.replaced(over, merged).replaced(over[grown], before.select(over[grown]))
-    return body, shrunk.index_fill(0, over[grown], False)
-
-
-def _array(tensor: Tensor) -> NDArray:
-    return tensor.detach().cpu().numpy()

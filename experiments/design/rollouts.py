@@ -1,0 +1,138 @@
+"""Random teams in closed loop under a disturbance, and what observers make of them: what gains are trained on.
+
+The velocity executed is u* + w with w even in a disc of radius `noise`; it is measured exactly, and so are positions:
+every observer sees the same disturbance, the filter through positions, the set through velocities. Theta(t), G and f do
+not depend on the gain, so one run of the team serves any number of passes of the training.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from experiments.design.adaptive import Step
+from experiments.design.config import LearnedObserverConfig
+from torchfsid.observers.hybrid import HybridObserver
+from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.observers.ukf import ParameterUkf
+from torchfsid.robots.bounds import NoiseBound
+from torchfsid.robots.controller import CbfQpController
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.simulation import closed_loop
+from torchfsid.robots.tasks import GoalTask
+from torchfsid.sets.feasible_set import FeasibleSet
+
+
+@dataclass(frozen=True)
+class Rollouts:
+    """What was seen of B robots, teams one after the other, and what other observers make of it.
+
+    Attributes:
+        steps: sample by sample, what an adaptive observer uses.
+        goals: the truth [m].
+        noise: bound of the disturbance [m/s].
+        theta, information: centre and information matrix of the prior.
+        estimates: by observer, (T, B, 2) [m]: `centroid`, and where filters were run `ukf` and `hybrid`.
+        contains: the share of samples at which Theta(t) holds the truth.
+    """
+
+    steps: list[Step]
+    goals: Float[Tensor, "B 2"]
+    noise: float
+    theta: Float[Tensor, "B 2"]
+    information: Float[Tensor, "B 2 2"]
+    estimates: dict[str, Float[Tensor, "T B 2"]]
+    contains: float
+
+
+def roll_out(
+    config: LearnedObserverConfig, noise: float, teams: int, seed: np.random.SeedSequence, filters: bool
+) -> Rollouts:
+    """Draw and run teams, all in one batch. `filters`: run the UKF and the hybrid too, which takes longest."""
+    random = np.random.default_rng(seed)
+    scenes = [config.team.draw(random) for _ in range(teams)]
+    starts, goals = (
+        torch.tensor([[robot[key] for robot in scene["robots"]] for scene in scenes], dtype=torch.float64)
+        for key in ("start", "goal")
+    )
+    places = [[obstacle["position"] for obstacle in scene["obstacles"]] for scene in scenes]
+    N, K = starts.shape[1], len(places[0])
+    obstacles = torch.tensor(places, dtype=torch.float64).reshape(len(scenes), 1, K, 2).expand(-1, N, -1, -1)
+    B = len(scenes) * N
+    in_disc = random.uniform(size=(2, config.steps, B))
+    radius, angle = torch.from_numpy(np.sqrt(in_disc[0])), torch.from_numpy(2 * np.pi * in_disc[1])
+    disturbance = (noise * radius).unsqueeze(-1) * torch.stack([angle.cos(), angle.sin()], dim=-1)
+
+    others = torch.cat([~torch.eye(N, dtype=torch.bool), torch.ones(N, K, dtype=torch.bool)], dim=1)
+    present = others.repeat(len(scenes), 1)
+
+    def around(t: float, x: Tensor, _: Tensor) -> Measurement:
+        team = x.reshape(-1, 1, N, 2).expand(-1, N, -1, -1)
+        return Measurement(t=t, x=x, u=None, bodies=torch.cat([team, obstacles], dim=2).flatten(0, 1), present=present)
+
+    task, barriers = GoalTask(config.gain), [config.avoidance.build([])]
+    truth, start = goals.flatten(0, 1), starts.flatten(0, 1)
+    loop = closed_loop(
+        CbfQpController(task, barriers),
+        truth,
+        start,
+        around,
+        dt=config.dt,
+        samples=config.steps,
+        disturbance=disturbance,
+    )
+    lower, upper = (torch.tensor(bound, dtype=torch.float64) for bound in (config.prior.lower, config.prior.upper))
+    prior = FeasibleSet.from_box(lower.expand(B, 2), upper.expand(B, 2))
+    sets = SetMembershipObserver(
+        task, barriers, prior, noise=NoiseBound(noise), active_tolerance=config.active_tolerance + noise
+    )
+    spread = (upper - lower) / 12**0.5
+    hybrid = _hybrid(config, sets, noise) if filters else None
+    steps, estimates, contained = [], {"centroid": [], **({"ukf": [], "hybrid": []} if filters else {})}, []
+    with torch.no_grad():
+        for measurement, _ in loop:
+            if hybrid is None:
+                estimate = sets.update(measurement)
+            else:
+                both = hybrid.update(measurement)
+                estimate = both.set_estimate
+                estimates["ukf"].append(both.ukf_estimate.theta)
+                estimates["hybrid"].append(both.theta)
+            theta_set, u = estimate.feasible_set, measurement.u
+            assert u is not None
+            kkt = estimate.kkt
+            # A sample that says nothing moves no estimate.
+            G = torch.where(estimate.informative[:, None, None], kkt.G, 0.0)
+            facets, area, centroid = theta_set.facets().halfspaces, theta_set.volume(), estimate.theta
+            steps.append(Step(facets, area, centroid, kkt.case, G, kkt.f, u, noise))
+            estimates["centroid"].append(centroid)
+            contained.append(theta_set.contains(truth).double().mean())
+    return Rollouts(
+        steps,
+        truth,
+        noise,
+        ((lower + upper) / 2).expand(B, 2),
+        torch.diag_embed(1 / spread**2).expand(B, 2, 2),
+        {name: torch.stack(of) for name, of in estimates.items()},
+        float(torch.stack(contained).mean()),
+    )
+
+
+def _hybrid(config: LearnedObserverConfig, sets: SetMembershipObserver, noise: float) -> HybridObserver:
+    """The filter is told how large the disturbance is: `noise`/2 along an axis, anew at every sample."""
+    prior = sets.feasible_set.body.vertices
+    ukf = ParameterUkf.from_prior(
+        sets.task,
+        sets.barriers,
+        prior.amin(1),
+        prior.amax(1),
+        position_noise=config.ukf.position_noise,
+        process_noise=config.ukf.process_noise,
+        motion_noise=noise / 2 * config.dt**0.5,
+        active_tolerance=sets.active_tolerance,
+    )
+    return HybridObserver(sets, ukf, feedback=config.ukf.feedback)

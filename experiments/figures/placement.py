@@ -1,0 +1,45 @@
+"""The figures of a placed probe: the search, what the probe changes, and a film of that."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from experiments.design.config import ProbePlacementConfig
+from experiments.figures.film import Film
+from experiments.figures.probe import draw_before_after, draw_search, name_of
+from experiments.figures.probe_animation import animate
+from experiments.results import damaged, read_json, reading
+
+
+def draw_placement(folder: Path, config: ProbePlacementConfig) -> Iterator[tuple[str, Figure | Film]]:
+    replay = _replay(folder / "replay.json")
+    yield "figure", draw_search(folder, config)
+    yield "comparison", draw_before_after(replay, config)
+    yield "animation", animate(replay, config)
+
+
+def _replay(path: Path) -> dict[str, Any]:
+    """What happens to one goal, without a probe and with several: checked here, so that it can be drawn."""
+    with reading(path):
+        replay = read_json(path)
+        _points(replay["goal"], *replay["obstacles"])
+        for run in replay["runs"]:
+            name_of(run)
+            _points(*(run["way_point_places"] or []))
+            for sample in run["samples"]:
+                _points(sample["x"], *sample["vertices"], *([sample["probe"]] if sample["probe"] else []))
+                _points([sample["t"], sample["area"]])
+                sample["active"] = list(sample["active"])
+    if len({len(run["samples"]) for run in replay["runs"]}) != 1 or not replay["runs"][0]["samples"]:
+        damaged(path, "its runs are of different lengths")
+    return replay
+
+
+def _points(*points: Any) -> None:
+    """Raises `ValueError` or `TypeError` for what is not a pair of numbers."""
+    np.array(points, dtype=float).reshape(len(points), 2)

@@ -1,0 +1,121 @@
+"""The kinds of configuration files: one table of what is done with each.
+
+Its functions are imported when they are called, so that a mistake in a file is found before PyTorch is loaded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Literal
+
+from experiments.design.config import LearnedObserverConfig, ProbePlacementConfig
+from experiments.runs.config import CasesConfig, SceneConfig, SwarmConfig
+from experiments.sweeps.config import SweepConfig, override_sweep
+from torchfsid.config.documents import Strict, apply_overrides, read_yaml, validate
+from torchfsid.errors import ConfigError
+
+Config = SceneConfig | CasesConfig | SwarmConfig | SweepConfig | ProbePlacementConfig | LearnedObserverConfig
+
+Command = Literal["run", "sweep", "design"]
+
+Track = Callable[..., Iterable[Any]]
+"""Passes items on and shows how far they have come: (items, what is done, how many there are, completed=0)."""
+
+
+@dataclass(frozen=True)
+class Later:
+    """A function of `experiments`, imported when it is called."""
+
+    module: str
+    name: str
+
+    def __call__(self, *arguments: Any, **options: Any) -> Any:
+        return getattr(import_module(f"experiments.{self.module}"), self.name)(*arguments, **options)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What is done with the files of a kind.
+
+    Attributes:
+        command: of `python -m experiments`, for which these files are.
+        config: the record of such a file.
+        run: (config, folder, track) -> summary. Writes the results into the folder, all but summary and figures.
+        show: (summary, console) -> nothing. Prints what the results show.
+        draw: (folder, config) -> (name, figure or film) pairs. Draws from the files of the folder.
+    """
+
+    command: Command
+    config: type[Strict]
+    run: Later
+    show: Later
+    draw: Later
+
+
+KINDS = {
+    "scene": Kind(
+        "run",
+        SceneConfig,
+        Later("runs.scene", "run_scene"),
+        Later("runs.verdict", "print_verdict"),
+        Later("figures.scene", "draw_scene"),
+    ),
+    "cases": Kind(
+        "run",
+        CasesConfig,
+        Later("runs.cases", "run_cases"),
+        Later("runs.table", "print_cases"),
+        Later("figures.cases", "draw_cases"),
+    ),
+    "swarm": Kind(
+        "run",
+        SwarmConfig,
+        Later("runs.swarm", "run_swarm"),
+        Later("runs.swarm", "print_swarm"),
+        Later("figures.swarm", "draw_swarm"),
+    ),
+    "sweep": Kind(
+        "sweep",
+        SweepConfig,
+        Later("sweeps.sweep", "run_sweep"),
+        Later("sweeps.summary", "print_sweep"),
+        Later("figures.sweep", "draw_sweep"),
+    ),
+    "probe_placement": Kind(
+        "design",
+        ProbePlacementConfig,
+        Later("design.placement", "place"),
+        Later("design.placement", "print_placement"),
+        Later("figures.placement", "draw_placement"),
+    ),
+    "learned_observer": Kind(
+        "design",
+        LearnedObserverConfig,
+        Later("design.learning", "learn"),
+        Later("design.learning", "print_learning"),
+        Later("figures.learning", "draw_learning"),
+    ),
+}
+
+
+def load(path: str | Path, overrides: Sequence[str] = (), command: Command | None = None) -> Config:
+    """The configuration in a file, after `overrides` such as "noise.velocity=0.02".
+
+    Args:
+        command: for which it has to be; None: for any.
+
+    Raises:
+        ConfigError: the file is none, or of a kind for another command.
+    """
+    mapping = read_yaml(path)
+    mapping = (override_sweep if mapping.get("kind") == "sweep" else apply_overrides)(mapping, overrides)
+    kind, expected = mapping.get("kind"), [name for name, of in KINDS.items() if command in (None, of.command)]
+    if kind not in expected:
+        raise ConfigError(f"{path}: kind: expected one of {', '.join(map(repr, expected))}, got {kind!r}")
+    config: Any = validate(mapping, KINDS[str(kind)].config, source=str(path))
+    if isinstance(config, SweepConfig):
+        config.check_runs(source=str(path))
+    return config

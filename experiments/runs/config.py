@@ -1,0 +1,286 @@
+"""The files in `configs/`: `kind: scene` is a robot or a team in closed loop, `kind: cases` is the paper's Table I.
+
+Each file is complete: nothing is inherited, and what is left out has the default written here. No torch in this module.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from torchfsid.config.barriers import AvoidanceConfig, BarrierConfig
+from torchfsid.config.documents import Strict, wrong
+from torchfsid.config.observers import NoiseConfig, PriorConfig, UkfConfig
+from torchfsid.config.quantities import BodyName, NonNegative, Number, PlanarVector, Positive
+from torchfsid.config.tasks import GoalConfig
+
+if TYPE_CHECKING:
+    from torchfsid.identification.evidence import SetKind
+    from torchfsid.observers.set_membership import SetMembershipObserver
+    from torchfsid.robots.barriers import Barrier
+    from torchfsid.robots.tasks import Task
+
+MAX_STEPS = 1_000_000
+"""More is a slip of the pen in dt or duration."""
+
+Text = Annotated[str, Field(min_length=1)]
+WholeNumber = Annotated[int, Field(strict=True, ge=0)]
+
+
+class RobotConfig(Strict):
+    """A robot, where it starts and where it wants to go [m]."""
+
+    name: BodyName
+    start: PlanarVector
+    goal: PlanarVector
+
+
+class ObstacleConfig(Strict):
+    """A body that stands still [m]."""
+
+    name: BodyName
+    position: PlanarVector
+
+
+class MeasurementNoiseConfig(Strict):
+    """The errors of what the observer sees of the robots, of at most these lengths [m/s], [m].
+
+    `shape`: `uniform` in discs; `bias`: one error of full length per robot, the same at all times; `adversarial`: of
+    full length, chosen at every sample by somebody who knows the truth and the observer (`experiments.runs.errors`).
+    """
+
+    velocity: NonNegative = 0.0
+    position: NonNegative = 0.0
+    shape: Literal["uniform", "bias", "adversarial"] = "uniform"
+
+
+class ExpectedConfig(Strict):
+    """What the paper says is active until a time [s]: these bodies, or so many of them."""
+
+    until: Positive
+    active: tuple[BodyName, ...] | None = None
+    count: WholeNumber | None = None
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> ExpectedConfig:
+        if (self.active is None) == (self.count is None):
+            raise wrong("expected either active (names) or count (a number)")
+        return self
+
+
+class ExperimentConfig(Strict):
+    """What all experiments share: the declared model and the observers.
+
+    Attributes:
+        title: of the figures.
+        dt, duration: sampling time and length of the run [s].
+        set: the set of the plain columns, of regions.json and of the hybrid estimate; the other one runs alongside.
+        active_tolerance: distance to its boundary below which a row counts as active [m/s].
+        noise: bounds for the inverse-optimal set.
+    """
+
+    kind: str
+    title: Text
+    task: GoalConfig
+    barriers: Annotated[tuple[BarrierConfig, ...], Field(min_length=1)]
+    dt: Positive
+    duration: Positive
+    prior: PriorConfig
+    set: Literal["critical_region", "inverse_optimal"]
+    active_tolerance: Positive = 1e-3
+    noise: NoiseConfig
+    ukf: UkfConfig = UkfConfig()
+
+    @property
+    def steps(self) -> int:
+        return round(self.duration / self.dt)
+
+    @property
+    def safety_distance(self) -> float | None:
+        """Of the first barrier that has one [m]: the size in which bodies are drawn."""
+        distances = (getattr(barrier, "safety_distance", None) for barrier in self.barriers)
+        return next((distance for distance in distances if distance is not None), None)
+
+    def build_sets(self, kind: SetKind, task: Task, barriers: Sequence[Barrier], robots: int) -> SetMembershipObserver:
+        """The observer of one kind of set. The critical region knows no bound but its active tolerance: the bound also
+        decides on alarms."""
+        from torchfsid.observers.set_membership import SetMembershipObserver
+
+        noise = self.noise.build() if kind == "inverse_optimal" else None
+        prior = self.prior.build(robots)
+        return SetMembershipObserver(
+            task, barriers, prior, kind=kind, noise=noise, active_tolerance=self.active_tolerance
+        )
+
+    @model_validator(mode="after")
+    def _fits_the_task(self) -> ExperimentConfig:
+        if len(self.prior.lower) != self.task.parameters:
+            raise wrong(f"a goal has {self.task.parameters} entries, lower has {len(self.prior.lower)}", "prior")
+        if not 1 <= self.duration / self.dt <= MAX_STEPS:
+            raise wrong(f"expected 1 to {MAX_STEPS} steps of dt = {self.dt} s, got {self.duration} s", "duration")
+        return self
+
+    def _require_in_prior(self, goal: Sequence[float], path: str) -> None:
+        bounds = zip(self.prior.lower, goal, self.prior.upper, strict=True)
+        if not all(low <= x <= high for low, x, high in bounds):
+            raise wrong(f"the prior does not hold it: {list(goal)}", path)
+
+
+class SceneConfig(ExperimentConfig):
+    """A robot among obstacles, or a team in which every robot avoids every other.
+
+    Attributes:
+        seed: of the measurement noise.
+        snapshots: times of the figure's panels [s].
+        expected: the timeline of active obstacles to compare with; for scenes of one robot.
+    """
+
+    kind: Literal["scene"]
+    robots: Annotated[tuple[RobotConfig, ...], Field(min_length=1)]
+    obstacles: tuple[ObstacleConfig, ...] = ()
+    seed: WholeNumber
+    measurement_noise: MeasurementNoiseConfig = MeasurementNoiseConfig()
+    snapshots: Annotated[tuple[NonNegative, ...], Field(min_length=1, max_length=4)]
+    expected: tuple[ExpectedConfig, ...] = ()
+
+    @property
+    def bodies(self) -> list[str]:
+        return [body.name for body in (*self.robots, *self.obstacles)]
+
+    @model_validator(mode="after")
+    def _is_a_scene(self) -> SceneConfig:
+        names = self.bodies
+        if repeated := [name for i, name in enumerate(names) if name in names[:i]]:
+            raise wrong(f"two bodies are called {repeated[0]!r}", "robots, obstacles")
+        for i, robot in enumerate(self.robots):
+            self._require_in_prior(robot.goal, f"robots[{i}].goal")
+        for i, barrier in enumerate(self.barriers):
+            if barrier.uses_radius:
+                raise wrong("bodies of a scene have no radius: give safety_distance", f"barriers[{i}].margin")
+        require_increasing(self.snapshots, "snapshots")
+        if self.snapshots[-1] > self.duration:
+            raise wrong(f"must not be after the end, {self.duration} s, got {self.snapshots[-1]}", "snapshots")
+        self._check_expected()
+        return self
+
+    def _check_expected(self) -> None:
+        if self.expected and len(self.robots) > 1:
+            raise wrong("only a scene of one robot has an expected timeline", "expected")
+        require_increasing([interval.until for interval in self.expected], "expected")
+        obstacles = [obstacle.name for obstacle in self.obstacles]
+        for i, interval in enumerate(self.expected):
+            if unknown := [name for name in interval.active or () if name not in obstacles]:
+                raise wrong(f"no obstacle is called {unknown[0]!r}", f"expected[{i}].active")
+
+
+class CaseBodyConfig(Strict):
+    """A body beside the robot: in which direction [deg], of which radius [m], and which speed its row leaves the robot
+    in that direction [m/s]. Without `speed`, the row goes through the case's `meet`: it is an active one."""
+
+    direction: Number
+    radius: Positive
+    speed: Number | None = None
+
+
+class CaseConfig(Strict):
+    """One line of Table I: the bodies around a robot, and the letter of the case that they are to realise.
+
+    `meet` is the control through which the active rows go, in the frame of the directions [m/s].
+    """
+
+    name: BodyName
+    letter: Literal["A", "B", "C", "D", "E"]
+    meet: PlanarVector = (0.0, 0.0)
+    bodies: Annotated[tuple[CaseBodyConfig, ...], Field(min_length=1)]
+
+
+class CasesConfig(ExperimentConfig):
+    """Constructed scenes in which a robot is held in one of the paper's cases by bodies that move along with it.
+
+    Attributes:
+        start, goal: of the robot, in every case [m]. radius: of the robot [m].
+        spin: how fast the directions turn [deg/s].
+    """
+
+    kind: Literal["cases"]
+    start: PlanarVector
+    goal: PlanarVector
+    radius: Positive
+    spin: Number = 0.0
+    cases: Annotated[tuple[CaseConfig, ...], Field(min_length=1)]
+
+    @property
+    def avoidance(self) -> AvoidanceConfig:
+        """The one barrier, whose rows the bodies' places are computed from."""
+        barrier = self.barriers[0]
+        assert isinstance(barrier, AvoidanceConfig)
+        return barrier
+
+    @model_validator(mode="after")
+    def _is_a_table(self) -> CasesConfig:
+        self._require_in_prior(self.goal, "goal")
+        names = [case.name for case in self.cases]
+        if repeated := [name for i, name in enumerate(names) if name in names[:i]]:
+            raise wrong(f"two cases are called {repeated[0]!r}", "cases")
+        barrier = self.barriers[0]
+        if len(self.barriers) > 1 or not isinstance(barrier, AvoidanceConfig) or barrier.margin is None:
+            raise wrong("expected one avoidance barrier with a margin", "barriers")
+        if (barrier.distance, barrier.class_k.power, barrier.neighbour_velocity) != ("squared", 1, "none"):
+            raise wrong("expected the paper's row: squared, power 1, neighbour_velocity none", "barriers[0]")
+        return self
+
+
+class SwarmConfig(ExperimentConfig):
+    """Many robots in a square, each of which sees no more than its nearest neighbours. No filter runs along.
+
+    Attributes:
+        robots: how many. side: of the square [m]. separation: between their starts [m].
+        travel: goals lie in discs of this radius around the starts, within the square [m].
+        neighbours, sensing_radius: a robot avoids so many of its nearest neighbours within this distance [m].
+        seed: of everything random.
+    """
+
+    kind: Literal["swarm"]
+    robots: Annotated[int, Field(strict=True, ge=1)]
+    side: Positive
+    separation: NonNegative
+    travel: Positive
+    neighbours: Annotated[int, Field(strict=True, ge=1)]
+    sensing_radius: Positive
+    seed: WholeNumber
+    measurement_noise: MeasurementNoiseConfig = MeasurementNoiseConfig()
+    snapshots: Annotated[tuple[NonNegative, ...], Field(min_length=1, max_length=4)]
+
+    @property
+    def spacing(self) -> float:
+        """Of the grid that starts are moved away from [m]."""
+        return self.side / math.ceil(math.sqrt(self.robots))
+
+    @model_validator(mode="after")
+    def _is_a_swarm(self) -> SwarmConfig:
+        self._require_in_prior((-self.side / 2, -self.side / 2), "side")
+        self._require_in_prior((self.side / 2, self.side / 2), "side")
+        if self.separation > self.spacing:
+            raise wrong(f"no room for {self.robots} robots {self.separation} m apart", "side")
+        if self.measurement_noise.position > 0 or self.measurement_noise.shape != "uniform":
+            raise wrong("a swarm knows uniform errors of velocities only", "measurement_noise")
+        for i, barrier in enumerate(self.barriers):
+            if barrier.neighbour_velocity == "current":
+                raise wrong("no joint QP over a swarm: none or previous", f"barriers[{i}].neighbour_velocity")
+            if barrier.uses_radius:
+                raise wrong("bodies of a swarm have no radius: give safety_distance", f"barriers[{i}].margin")
+        require_increasing(self.snapshots, "snapshots")
+        if self.snapshots[-1] > self.duration:
+            raise wrong(f"must not be after the end, {self.duration} s, got {self.snapshots[-1]}", "snapshots")
+        return self
+
+
+def require_increasing(times: Sequence[float], path: str) -> None:
+    """Raises, in a validator, the error for times that do not."""
+    for before, after in pairwise(times):
+        if not before < after:
+            raise wrong(f"times must increase, got {after} after {before}", path)

@@ -1,0 +1,66 @@
+"""Observe a recording into a results folder: estimates.csv, regions.json and regions.jsonl."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from experiments.kinds import Track
+from experiments.results import Appender
+from experiments.runs.observers import Observers
+from experiments.runs.recording import Recording
+from torchfsid.commands.results import ResultsWriter
+from torchfsid.observers.set_membership import SetEstimate
+from torchfsid.robots.barriers import stack_barriers
+from torchfsid.robots.measurement import Measurement
+
+
+def observe(observers: Observers, out: Path, track: Track) -> None:
+    """Every sample is on disk before the next one is observed."""
+    recording = observers.recording
+    first, *others = observers.sets
+    alongside = {kind: observers.sets[kind] for kind in others}
+    with (
+        ResultsWriter(out, recording.robots, observers.sets[first], alongside) as results,
+        Appender(out / "regions.jsonl") as regions,
+    ):
+        for measurement in track(recording.measurements, "Observing", recording.samples):
+            estimate, sets = observers.update(measurement)
+            results.write(measurement, estimate, {kind: sets[kind] for kind in others})
+            regions.append("".join(json.dumps(line) + "\n" for line in _regions(recording, measurement, sets)))
+
+
+def _regions(recording: Recording, measurement: Measurement, sets: dict[str, SetEstimate]) -> Iterator[dict[str, Any]]:
+    assert measurement.u is not None
+    rows = stack_barriers(recording.barriers, measurement).normalised()
+    real = (rows.A != 0).any(-1)
+    active = next(iter(sets.values())).kkt.active
+    C, d = recording.task(measurement)
+    nominal = (C @ recording.goals.unsqueeze(-1)).squeeze(-1) + d
+    vertices = {kind: estimate.feasible_set.vertices() for kind, estimate in sets.items()}
+    for i, robot in enumerate(recording.robots):
+        yield {
+            "t": measurement.t,
+            "robot": robot,
+            "x": measurement.x[i].tolist(),
+            "u": measurement.u[i].tolist(),
+            "nominal": nominal[i].tolist(),
+            "active": [recording.row_names[j] for j in active[i].nonzero().flatten().tolist()],
+            "rows": torch.cat([rows.A[i], rows.b[i].unsqueeze(-1)], dim=-1)[real[i]].tolist(),
+            **{kind: _distinct(of_kind[i]).tolist() for kind, of_kind in vertices.items()},
+        }
+
+
+def _distinct(vertices: Tensor) -> Tensor:
+    """Padding repeats the first vertex at the end; an empty set has none."""
+    vertices = vertices[vertices.isfinite().all(-1)]
+    if len(vertices) == 0:
+        return vertices
+    padding = (vertices == vertices[0]).all(-1)
+    padding[0] = False
+    return vertices[~padding]

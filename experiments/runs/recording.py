@@ -1,0 +1,82 @@
+"""A recording: what an observer will see of some robots, with the truth beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from experiments.runs.config import SceneConfig
+from experiments.runs.errors import measure
+from torchfsid.robots.barriers import Barrier
+from torchfsid.robots.controller import CbfQpController
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.simulation import Trajectory, simulate
+from torchfsid.robots.tasks import Task
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Measurements of a batch of robots, in the order of time.
+
+    Attributes:
+        robots: their names.
+        goals: the truth [m].
+        task, barriers: the model, which is also what the observers assume.
+        row_names: for each row of the barriers, the body that it avoids or the row's label.
+        measurements: what is seen.
+        samples: how many there are.
+    """
+
+    robots: list[str]
+    goals: Float[Tensor, "B 2"]
+    task: Task
+    barriers: list[Barrier]
+    row_names: list[str]
+    measurements: Iterator[Measurement]
+    samples: int
+
+
+@dataclass(frozen=True)
+class SimulatedScene:
+    """A scene that was run: the true trajectory, and what is measured of it."""
+
+    config: SceneConfig
+    task: Task
+    barriers: list[Barrier]
+    true: Trajectory
+    measured: Trajectory
+
+    def recording(self) -> Recording:
+        labels = [label for barrier in self.barriers for label in barrier.labels(self.config.bodies)]
+        return Recording(
+            robots=[robot.name for robot in self.config.robots],
+            goals=_points([robot.goal for robot in self.config.robots]),
+            task=self.task,
+            barriers=self.barriers,
+            row_names=[label.removeprefix("avoid ") for label in labels],
+            measurements=self.measured.measurements(),
+            samples=len(self.measured.t),
+        )
+
+
+def simulate_scene(config: SceneConfig) -> SimulatedScene:
+    """Run the scene's robots in closed loop, and measure them as well as the config says."""
+    task = config.task.build(config.bodies)
+    barriers: list[Barrier] = [barrier.build(config.bodies) for barrier in config.barriers]
+    true = simulate(
+        CbfQpController(task, barriers),
+        _points([robot.goal for robot in config.robots]),
+        _points([robot.start for robot in config.robots]),
+        dt=config.dt,
+        steps=config.steps,
+        obstacles=_points([obstacle.position for obstacle in config.obstacles]),
+    )
+    return SimulatedScene(config, task, barriers, true, measure(true, config))
+
+
+def _points(points: list[tuple[float, ...]]) -> Float[Tensor, "points 2"]:
+    return torch.tensor(points, dtype=torch.float64).reshape(-1, 2)

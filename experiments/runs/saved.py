@@ -1,0 +1,123 @@
+"""The results folder of a scene or of constructed cases, read back. No torch in this module."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from experiments.results import Columns, read_columns, read_json, read_lines, reading, require_length
+from experiments.runs.config import CasesConfig, SceneConfig
+
+SETS: tuple[Literal["critical_region", "inverse_optimal"], ...] = ("critical_region", "inverse_optimal")
+
+
+@dataclass(frozen=True)
+class Region:
+    """What regions.jsonl says about a robot at one time.
+
+    Attributes:
+        active: names of the active rows.
+        vertices: of both kinds of set [m].
+        rows: unit rows (a_x, a_y, b) over the control.
+        u, nominal: the control and the nominal one [m/s].
+    """
+
+    active: list[str]
+    vertices: dict[str, np.ndarray]
+    rows: np.ndarray
+    u: np.ndarray
+    nominal: np.ndarray
+
+
+@dataclass(frozen=True)
+class Results:
+    """The folder of a run. Robots come in the order of the config, times increase."""
+
+    folder: Path
+    config: SceneConfig | CasesConfig
+
+    @cached_property
+    def robots(self) -> list[str]:
+        named = self.config.cases if isinstance(self.config, CasesConfig) else self.config.robots
+        return [robot.name for robot in named]
+
+    @cached_property
+    def goals(self) -> np.ndarray:
+        """(robots, 2) [m]"""
+        if isinstance(self.config, CasesConfig):
+            return np.array([self.config.goal] * len(self.robots))
+        return np.array([robot.goal for robot in self.config.robots])
+
+    @cached_property
+    def t(self) -> np.ndarray:
+        return self.numbers("t")[:, 0]
+
+    def numbers(self, *columns: str) -> np.ndarray:
+        """Columns of estimates.csv: (times, robots), or with more than one (times, robots, columns)."""
+        values = np.stack([self._by_robot(self._table.numbers(column)) for column in columns], axis=-1)
+        return values[..., 0] if len(columns) == 1 else values
+
+    def of_set(self, kind: str, *columns: str) -> np.ndarray:
+        """The same for the columns of one kind of set."""
+        prefix = "" if kind == self.config.set else f"{kind}_"
+        return self.numbers(*(prefix + column for column in columns))
+
+    def error(self, *columns: str) -> np.ndarray:
+        """Distances of point estimates to the goals: (times, robots) [m]"""
+        return np.linalg.norm(self.numbers(*columns) - self.goals, axis=-1)
+
+    def cases(self) -> np.ndarray:
+        """Letters, (times, robots)."""
+        return self._by_robot(self._table["case"])
+
+    def n_active(self) -> np.ndarray:
+        """(times, robots)"""
+        return self.numbers("n_active").astype(int)
+
+    def at(self, t: float) -> int:
+        """The sample nearest to a time."""
+        return int(np.abs(self.t - t).argmin())
+
+    @cached_property
+    def regions(self) -> list[list[Region]]:
+        """By sample, then robot."""
+        path, count = self.folder / "regions.jsonl", len(self.robots)
+        with reading(path):
+            lines = [_region(line) for line in read_lines(path)]
+        require_length(path, len(lines), count * len(self.t))
+        return [lines[i : i + count] for i in range(0, len(lines), count)]
+
+    @cached_property
+    def paths(self) -> dict[str, np.ndarray]:
+        """Of every body: (times, 2) [m]."""
+        assert isinstance(self.config, SceneConfig)
+        table, paths = read_columns(self.folder / "trajectory.csv"), {}
+        for body in self.config.bodies:
+            of_body = table.where(robot=body).of_length(len(self.t))
+            paths[body] = np.stack([of_body.numbers("x"), of_body.numbers("y")], axis=-1)
+        return paths
+
+    @cached_property
+    def summary(self) -> dict[str, Any]:
+        return read_json(self.folder / "summary.json")
+
+    @cached_property
+    def _table(self) -> Columns:
+        return read_columns(self.folder / "estimates.csv").of_length((self.config.steps + 1) * len(self.robots))
+
+    def _by_robot(self, column: np.ndarray) -> np.ndarray:
+        return column.reshape(-1, len(self.robots))
+
+
+def _region(line: dict[str, Any]) -> Region:
+    return Region(
+        active=[str(name) for name in line["active"]],
+        vertices={kind: np.array(line[kind], dtype=float).reshape(-1, 2) for kind in SETS},
+        rows=np.array(line["rows"], dtype=float).reshape(-1, 3),
+        u=np.array(line["u"], dtype=float).reshape(2),
+        nominal=np.array(line["nominal"], dtype=float).reshape(2),
+    )

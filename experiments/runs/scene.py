@@ -1,0 +1,38 @@
+"""A run of a scene: one robot among obstacles, or a team."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from experiments.kinds import Track
+from experiments.results import write_rows
+from experiments.runs.config import SceneConfig
+from experiments.runs.observe import observe
+from experiments.runs.observers import Observers
+from experiments.runs.recording import simulate_scene
+from experiments.runs.saved import Results
+from experiments.runs.summary import summarise_scene
+from torchfsid.robots.simulation import Trajectory
+
+
+def run_scene(config: SceneConfig, out: Path, track: Track) -> dict[str, Any]:
+    """Simulate and observe; returns the summary."""
+    scene = simulate_scene(config)
+    write_trajectory(out / "trajectory.csv", config.bodies, scene.measured)
+    observers = Observers(config, scene.recording())
+    observe(observers, out, track)
+    return summarise_scene(Results(out, config), observers, scene.true)
+
+
+def write_trajectory(path: Path, bodies: list[str], measured: Trajectory) -> None:
+    """All digits, so that an observer of the log sees what the observers of the run saw."""
+    names = "x", "y", "vx", "vy"
+    write_rows(
+        path,
+        (
+            {"t": t, "robot": body, **dict(zip(names, (*x[j], *u[j]), strict=True))}
+            for t, x, u in zip(measured.t.tolist(), measured.x.tolist(), measured.u.tolist(), strict=True)
+            for j, body in enumerate(bodies)
+        ),
+    )

@@ -1,0 +1,124 @@
+"""What a scene shows: the timeline of active obstacles, whether the promises held, and how fast each estimator was.
+
+A share (10 %, 1 %) is one of the value before the first measurement, that of the prior.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from experiments.runs.config import ExpectedConfig, ExperimentConfig, SceneConfig
+from experiments.runs.lengths import lengths, prior_lengths
+from experiments.runs.observers import Observers
+from experiments.runs.saved import Results
+from torchfsid.robots.simulation import Trajectory
+
+SHARES = (0.1, 0.01)
+
+
+def summarise_scene(results: Results, observers: Observers, true: Trajectory) -> dict[str, Any]:
+    """The content of summary.json."""
+    config, tally = observers.config, observers.tally
+    assert isinstance(config, SceneConfig)
+    active = {robot: [at[i].active for at in results.regions] for i, robot in enumerate(results.robots)}
+    measures = lengths(results)
+    prior = prior_lengths(results)
+    infeasible, deadlock = (~true.feasible).sum(0).tolist(), true.deadlocked_since.tolist()
+
+    def per_robot(values: Sequence[Any]) -> dict[str, Any]:
+        return dict(zip(results.robots, values, strict=True))
+
+    summary: dict[str, Any] = {
+        "title": config.title,
+        "settings": settings(config)
+        | {"measurement_noise": config.measurement_noise.model_dump(), "seed": config.seed},
+        "timeline": {robot: timeline(results.t, names) for robot, names in active.items()},
+    }
+    if config.expected:
+        summary["expected_timeline"] = compare(results.t, active[results.robots[0]], config.expected, config.dt)
+    return summary | {
+        "steps": tally.samples,
+        "truth_outside": {kind: per_robot(of.outside.tolist()) for kind, of in tally.sets.items()},
+        "area_grew": {kind: per_robot(of.grew.tolist()) for kind, of in tally.sets.items()},
+        "ukf_outside": {kind: per_robot(of.ukf_outside.tolist()) for kind, of in tally.sets.items()},
+        "before": {name: per_robot(values.tolist()) for name, values in prior.items()},
+        "at_snapshots": [
+            {
+                "t": float(results.t[k]),
+                **{name: per_robot(values[k].tolist()) for name, values in measures.items()},
+            }
+            for k in map(results.at, config.snapshots)
+        ],
+        "time_below": {
+            f"{share:.0%}": {
+                name: per_robot(
+                    [
+                        stays_below(results.t, of, share * before)
+                        for of, before in zip(values.T, prior[name], strict=True)
+                    ]
+                )
+                for name, values in measures.items()
+            }
+            for share in SHARES
+        },
+        "infeasible_steps": per_robot(infeasible),
+        "deadlocked_since": per_robot([None if math.isnan(t) else t for t in deadlock]),
+    }
+
+
+def settings(config: ExperimentConfig) -> dict[str, Any]:
+    """What every comparison depends on."""
+    lower, upper = np.array(config.prior.lower), np.array(config.prior.upper)
+    spread = config.ukf.prior_std or ((upper - lower) / math.sqrt(12)).tolist()
+    return {
+        "dt": config.dt,
+        "set": config.set,
+        "prior": {"lower": list(config.prior.lower), "upper": list(config.prior.upper)},
+        "noise_bound": config.noise.velocity,
+        "ukf": {"R": config.ukf.position_noise**2, "Q_per_second": config.ukf.process_noise**2, "prior_std": spread},
+    }
+
+
+def stays_below(t: np.ndarray, values: np.ndarray, bound: float) -> float | None:
+    """The first time from which on a value stays below a bound; None if it does not at the end. NaN, that of an empty
+    set, is not below."""
+    above = np.flatnonzero(~(values < bound))
+    first = above[-1] + 1 if len(above) else 0
+    return float(t[first]) if first < len(t) else None
+
+
+def timeline(t: np.ndarray, active: Sequence[list[str]]) -> list[dict[str, Any]]:
+    """Intervals [from, until) of the same active rows; the last one has no end."""
+    starts = [k for k in range(len(t)) if k == 0 or active[k] != active[k - 1]]
+    ends = [*(float(t[k]) for k in starts[1:]), None]
+    return [{"from": float(t[k]), "until": end, "active": active[k]} for k, end in zip(starts, ends, strict=True)]
+
+
+def compare(
+    t: np.ndarray, active: Sequence[list[str]], expected: Sequence[ExpectedConfig], dt: float
+) -> dict[str, Any]:
+    """How far a timeline is from the expected one: away from an expected switch by more than its `deviation` [s], all
+    samples agree. A sample stands for the time until the next one."""
+    deviations = [0.0] * len(expected)
+    for time, names in zip(t, active, strict=True):
+        middle = time + dt / 2
+        now = next((i for i, interval in enumerate(expected) if middle < interval.until), None)
+        if now is None or _agrees(names, expected[now]):
+            continue
+        switches = [i for i in (now - 1, now) if i >= 0]
+        nearest = min(switches, key=lambda i: abs(expected[i].until - middle))
+        far_end = time if expected[nearest].until > middle else time + dt
+        deviations[nearest] = max(deviations[nearest], abs(expected[nearest].until - far_end))
+    switches = [interval.until for interval in expected]
+    return {
+        "deviation": max(deviations),
+        "switches": [{"expected": at, "deviation": by} for at, by in zip(switches, deviations, strict=True)],
+    }
+
+
+def _agrees(names: list[str], expected: ExpectedConfig) -> bool:
+    return len(names) == expected.count if expected.active is None else set(names) == set(expected.active)

@@ -1,0 +1,54 @@
+"""What a run shows, as a table for people; everything in it stands in summary.json."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.console import Console
+
+from experiments.tables import table
+
+ESTIMATORS = {
+    "ukf": "UKF error",
+    "hybrid": "hybrid error",
+    "critical_region sqrt_area": "paper's region √area",
+    "critical_region diameter": "paper's region diameter",
+    "critical_region centroid": "paper's region centroid",
+    "critical_region centre": "paper's region centre",
+    "inverse_optimal sqrt_area": "inverse-optimal √area",
+    "inverse_optimal diameter": "inverse-optimal diameter",
+    "inverse_optimal centroid": "inverse-optimal centroid",
+    "inverse_optimal centre": "inverse-optimal centre",
+}
+
+
+def print_verdict(summary: dict[str, Any], console: Console) -> None:
+    for robot, intervals in summary["timeline"].items():
+        console.print(f"{robot}: " + "; ".join(map(_interval, intervals)), highlight=False)
+    if "expected_timeline" in summary:
+        console.print(f"Farthest from the expected timeline: {summary['expected_timeline']['deviation']:.3g} s")
+    console.print(f"{summary['steps']} steps per robot, of which")
+    for counted, promise in (("truth_outside", "the truth was outside"), ("area_grew", "the area grew")):
+        counts = ", ".join(f"{sum(of.values())} ({kind})" for kind, of in summary[counted].items())
+        console.print(f"  {promise}: {counts}", highlight=False)
+    console.print("From when on lengths are below 10 % / 1 % of the prior's \\[s]:")
+    robots = list(summary["timeline"])
+    shown = table([""], robots)
+    for name, label in ESTIMATORS.items():
+        of_shares = [summary["time_below"][share][name] for share in ("10%", "1%")]
+        shown.add_row(label, *(" / ".join(_time(of[robot]) for of in of_shares) for robot in robots))
+    console.print(shown)
+    for robot in robots:
+        if summary["infeasible_steps"][robot]:
+            console.print(f"[red]{robot}: {summary['infeasible_steps'][robot]} steps without a feasible control")
+        if summary["deadlocked_since"][robot] is not None:
+            console.print(f"[red]{robot}: in deadlock since {summary['deadlocked_since'][robot]:.2f} s")
+
+
+def _interval(interval: dict[str, Any]) -> str:
+    active = ", ".join(interval["active"]) or "none"
+    return active if interval["until"] is None else f"{active} until {interval['until']:.2f} s"
+
+
+def _time(t: float | None) -> str:
+    return "never" if t is None else f"{t:.2f}"

@@ -1,0 +1,1 @@
+"""Studies written for one page of the documentation each. No run needs them."""

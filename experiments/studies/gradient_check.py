@@ -1,0 +1,153 @@
+"""The gradient of a mean over goals (`probe.expectation`) against central differences of that mean.
+
+The same goals on both sides, so many that the jumps of single goals average out. Placements are drawn near the
+predicted path such that the probe matters, and that no difference steps across the safety distance: what is lost there
+is not seen by the gradient (docs/design.md).
+
+And where there is nothing to follow: the shares of placements from which the gradient is zero.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from experiments.design.config import ProbePlacementConfig
+from experiments.design.probe import Objective, Probing, expectation, slope
+from experiments.design.search import Search
+from experiments.kinds import Track
+
+CANDIDATES = 32
+"""Placements drawn at a time."""
+
+DRAWS = 20
+"""Times that candidates are drawn before fewer placements than asked for have to do."""
+
+SCOUTS = 8
+"""Goals that decide whether a placement is fit for the check."""
+
+CLEAR = 1.5
+"""No goal may be lost within so many steps of the differences."""
+
+MATTERS = 0.9
+"""The probe matters if some goal's area falls below this share of the prior's."""
+
+OBJECTIVES: tuple[Objective, ...] = ("area", "log_area")
+
+
+def check_gradients(config: ProbePlacementConfig, seed: np.random.SeedSequence, track: Track) -> list[dict[str, Any]]:
+    """A row per number of way-points, horizon and objective: the cosine between both gradients over all placements, the
+    median and the least of single ones, the ratio of their lengths; and the same without the second term."""
+    probing = Probing.of(config)
+    settings = config.gradient_check
+    jobs = [(K, horizon) for K in config.way_points for horizon in settings.horizons]
+    seeds = seed.spawn(len(config.way_points))
+    rows = []
+    for K, horizon in track(jobs, "Checking gradients", len(jobs)):
+        goals = probing.draw_goals(settings.goals, int(seed.generate_state(1)[0]))
+        search = Search.of(probing, goals[:SCOUTS], K, seeds[config.way_points.index(K)])
+        placements = _fit_for_it(search, horizon)
+        rows += _check(probing, placements, goals, horizon) if len(placements) else []
+    return rows
+
+
+def nothing_to_follow(config: ProbePlacementConfig, seed: np.random.SeedSequence) -> list[dict[str, Any]]:
+    """A row per number of way-points and way of drawing: the share of placements from which the gradient is zero, and
+    the share of outcomes (a placement with a goal) that do not count."""
+    probing, rows = Probing.of(config), []
+    goals = probing.draw_goals(config.goals.train, int(seed.generate_state(1)[0]))
+    for K, child in zip(config.way_points, seed.spawn(len(config.way_points)), strict=True):
+        search = Search.of(probing, goals, K, child)
+        for drawn, draw in (("anywhere", search.anywhere), ("near_path", search.near_path)):
+            placements = draw(CANDIDATES * DRAWS)
+            zero, unsound = [], []
+            for part in placements.split(CANDIDATES):
+                leaf = part.requires_grad_()
+                left = probing.left(leaf, goals)
+                gradient = slope(expectation(left.area, "area").sum(), leaf)
+                zero.append((gradient == 0).flatten(1).all(-1))
+                unsound.append(~left.sound)
+            shares = {"zero": float(torch.cat(zero).double().mean()), "lost": float(torch.cat(unsound).double().mean())}
+            rows.append({"way_points": K, "drawn": drawn, **shares})
+    return rows
+
+
+def _fit_for_it(search: Search, horizon: int) -> Tensor:
+    settings = search.probing.config.gradient_check
+    fit: list[Tensor] = []
+    for _ in range(DRAWS):
+        candidates = search.near_path(CANDIDATES)
+        with torch.no_grad():
+            area = search.probing.left(candidates, search.goals, horizon).area
+            good = (area < MATTERS * search.probing.prior_area).any(-1)
+            for step in _steps(candidates, CLEAR * settings.step):
+                for moved in (candidates + step, candidates - step):
+                    good &= search.probing.left(moved, search.goals, horizon).sound.all(-1)
+        fit.append(candidates[good])
+        if sum(map(len, fit)) >= settings.placements:
+            break
+    return torch.cat(fit)[: settings.placements]
+
+
+class _Gradients(NamedTuple):
+    """Of the mean over goals: by automatic differentiation, that without the score term, by central differences."""
+
+    whole: Tensor
+    smooth_part: Tensor
+    differences: Tensor
+
+
+def _check(probing: Probing, placements: Tensor, goals: Tensor, horizon: int) -> list[dict[str, Any]]:
+    of_each = [_gradients(probing, placement.unsqueeze(0), goals, horizon) for placement in placements]
+    rows = []
+    for objective in OBJECTIVES:
+        together = _Gradients(*map(torch.cat, zip(*(of[objective] for of in of_each), strict=True)))
+        about = {"way_points": placements.shape[1], "objective": objective, "placements": len(placements)}
+        rows.append(about | _compare(together) | {"horizon": horizon})
+    return rows
+
+
+def _gradients(probing: Probing, placement: Tensor, goals: Tensor, horizon: int) -> dict[Objective, _Gradients]:
+    step = probing.config.gradient_check.step
+    leaf = placement.clone().requires_grad_()
+    area = probing.left(leaf, goals, horizon).area
+    differences: dict[Objective, Tensor] = {objective: torch.zeros_like(placement) for objective in OBJECTIVES}
+    for direction in _steps(placement, step):
+        with torch.no_grad():
+            ahead, behind = (probing.left(at, goals, horizon).area for at in (leaf + direction, leaf - direction))
+            for objective, of in differences.items():
+                of += (expectation(ahead, objective) - expectation(behind, objective)) / (2 * step) * direction / step
+    found = {}
+    for objective, of in differences.items():
+        phi = area if objective == "area" else area.log()
+        (whole,) = torch.autograd.grad(expectation(area, objective).sum(), leaf, retain_graph=True)
+        (smooth_part,) = torch.autograd.grad(phi.mean(), leaf, retain_graph=True)
+        found[objective] = _Gradients(whole, smooth_part, of)
+    return found
+
+
+def _compare(of: _Gradients) -> dict[str, float]:
+    each = torch.cosine_similarity(of.whole.flatten(1), of.differences.flatten(1))
+    return {
+        "cosine": _cosine(of.whole, of.differences),
+        "median_cosine": float(each.median()),
+        "least_cosine": float(each.min()),
+        "length_ratio": float(of.whole.norm() / of.differences.norm()),
+        "cosine_without": _cosine(of.smooth_part, of.differences),
+        "length_ratio_without": float(of.smooth_part.norm() / of.differences.norm()),
+    }
+
+
+def _cosine(v: Tensor, w: Tensor) -> float:
+    return float(torch.cosine_similarity(v.flatten(), w.flatten(), dim=0))
+
+
+def _steps(placements: Tensor, step: float) -> list[Tensor]:
+    """A step along every coordinate of the way-points."""
+    K = placements.shape[1]
+    return list(
+        step * torch.eye(2 * K, dtype=torch.float64).reshape(2 * K, 1, K, 2).expand(-1, len(placements), -1, -1)
+    )

@@ -1,0 +1,60 @@
+"""What automatic differentiation does not see: the area that one goal leaves jumps where its active sets switch.
+
+A probe that stands still is moved along y, across the corridor. Between two switches of the history of active sets, A
+is smooth in its place and automatic differentiation gives d log A/dy; at a switch A jumps, and what it gives is the
+derivative of one side. What these derivatives add up to is therefore not how log A changes.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from experiments.design.probe import Probing, slope
+from torchfsid.identification.evidence import evidence
+from torchfsid.robots.measurement import Measurement
+
+REACH = 0.1
+"""The probe is moved so far, to either side [m]."""
+
+PLACES = 801
+"""On this way."""
+
+
+def across(probing: Probing, place: Float[Tensor, "2"], goal: Float[Tensor, "2"]) -> list[dict[str, Any]]:
+    """A row per place: log of the area [m^2], what its derivatives add up to from the first place, the number of
+    switches up to there. Places that are not allowed are left out."""
+    places = place.repeat(PLACES, 1, 1)
+    places[:, 0, 1] += torch.linspace(-REACH, REACH, PLACES, dtype=torch.float64)
+    places = places[(probing.allowed(places) == places).flatten(1).all(-1)].requires_grad_()
+    goals = goal.unsqueeze(0)
+    log_area = probing.left(places, goals).area[:, 0].log()
+    slopes, y = slope(log_area.sum(), places)[:, 0, 1], places.detach()[:, 0, 1]
+    log_area = log_area.detach()
+    with torch.no_grad():
+        seen = Measurement.concatenate([sample.measurement for sample in probing.loop(places, goals)])
+        active = evidence(probing.model, probing.prior_of(len(places)), seen).kkt.active
+        history = active.unflatten(0, (-1, len(places))).transpose(0, 1)
+    switched = (history[1:] != history[:-1]).flatten(1).any(-1).long()
+    columns = {
+        "y": y,
+        "log_area": log_area,
+        "by_derivatives": torch.cat([log_area[:1], log_area[0] + torch.cumulative_trapezoid(slopes, y)]),
+        "switches": torch.cat([switched.new_zeros(1), switched.cumsum(0)]),
+    }
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    return [dict(zip(columns, row, strict=True)) for row in rows]
+
+
+def summarise_switches(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """How often the history switches, how log A changes along the way, and what its derivatives add up to."""
+    first, last = rows[0], rows[-1]
+    return {
+        "way [m]": last["y"] - first["y"],
+        "switches": last["switches"],
+        "change of log A": last["log_area"] - first["log_area"],
+        "its derivatives add up to": last["by_derivatives"] - first["log_area"],
+    }

@@ -1,0 +1,225 @@
+"""What an observer says when its model is wrong. `python -m experiments.studies.wrong_models` prints the table.
+
+Teams of four robots cross a disc with two pillars, one joint QP over each team (`neighbour_velocity: current`), with
+random goals. Controls are measured with errors of a given size, in random directions. Each model is wrong in one thing.
+A robot is silent while its status is `ok` and the truth is not in its set, or there is no truth because its task is
+another one. It must not end so: docs/wrong_models.md says when it does, and why it cannot be helped then.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchfsid.commands.declared_log import AUTO_FACTOR
+from torchfsid.observers.consistency import Consistency
+from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.outcome import Status
+from torchfsid.robots.barriers import Barrier, ClassK, CollisionAvoidance
+from torchfsid.robots.bounds import NoiseBound
+from torchfsid.robots.controller import CbfQpController
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.simulation import Trajectory, simulate
+from torchfsid.robots.tasks import GoalTask, OrbitTask, Saturation, Task, VelocityTask
+from torchfsid.sets.feasible_set import FeasibleSet
+
+ROBOTS, DT, STEPS, GAIN = 4, 0.05, 120, 0.8
+AVOIDANCE = CollisionAvoidance(ClassK(2.0), safety_distance=0.5, neighbour_velocity="current")
+TASK = GoalTask(GAIN)
+SATURATED = GoalTask(GAIN, saturation=Saturation("norm", (0.7, 0.7)))
+PILLARS = torch.tensor([[0.4, 0.7], [-0.6, -0.4]], dtype=torch.float64)
+
+LEVELS = ((1e-6, 0.0), (0.02, 0.02), (0.02, 0.002))
+"""Declared bound and size of the errors [m/s]: exact data, errors as large as declared, a generous bound."""
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What an observer believes, and what it is given to see of the runs.
+
+    Attributes:
+        run: the task that the robots really have.
+        seen: changes the measurements. errors: multiply the size of the errors.
+    """
+
+    name: str
+    task: Task = TASK
+    barriers: Sequence[Barrier] = (AVOIDANCE,)
+    run: GoalTask = TASK
+    seen: Callable[[list[Measurement]], list[Measurement]] = lambda samples: samples
+    errors: float = 1.0
+
+
+def without_last_pillar(samples: list[Measurement]) -> list[Measurement]:
+    visible = torch.arange(ROBOTS + len(PILLARS)) < ROBOTS + len(PILLARS) - 1
+    return [replace(sample, present=sample.present & visible) for sample in samples]
+
+
+def shifted(by: int) -> Callable[[list[Measurement]], list[Measurement]]:
+    """Velocities of so many samples later, also the neighbours'."""
+
+    def shift(samples: list[Measurement]) -> list[Measurement]:
+        pairs = zip(samples[max(0, -by) :], samples[max(0, by) :], strict=False)
+        return [replace(at, u=later.u, body_velocities=later.body_velocities) for at, later in pairs]
+
+    return shift
+
+
+BELIEFS = (
+    Belief("right model"),
+    Belief("right model, saturated run", SATURATED, run=SATURATED),
+    Belief("neighbour velocity: none", barriers=[replace(AVOIDANCE, neighbour_velocity="none")]),
+    Belief("neighbour velocity: previous", barriers=[replace(AVOIDANCE, neighbour_velocity="previous")]),
+    Belief("linear task, saturated run", run=SATURATED),
+    Belief("gain + 20 %", GoalTask(1.2 * GAIN)),
+    Belief("gain - 20 %", GoalTask(0.8 * GAIN)),
+    Belief("gain + 5 %", GoalTask(1.05 * GAIN)),
+    Belief("gain + 2 %", GoalTask(1.02 * GAIN)),
+    Belief("safety distance + 20 %", barriers=[replace(AVOIDANCE, safety_distance=0.6)]),
+    Belief("safety distance - 20 %", barriers=[replace(AVOIDANCE, safety_distance=0.4)]),
+    Belief("safety distance + 2 %", barriers=[replace(AVOIDANCE, safety_distance=0.51)]),
+    Belief("class-K gain x 2", barriers=[replace(AVOIDANCE, class_k=ClassK(4.0))]),
+    Belief("class-K gain / 2", barriers=[replace(AVOIDANCE, class_k=ClassK(1.0))]),
+    Belief("a pillar is missing", seen=without_last_pillar),
+    Belief("errors 10 times too large", errors=10.0),
+    Belief("velocities one sample late", seen=shifted(-1)),
+    Belief("velocities one sample early", seen=shifted(1)),
+    Belief("wrong task: velocity", VelocityTask()),
+    Belief("wrong task: orbit", OrbitTask(0.5)),
+)
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How the robots of all runs end.
+
+    Attributes:
+        flagged: robots whose status is not ok. right: ok, and the truth is inside. silent: ok, and it is not.
+        away: how far it is outside, at most [m].
+        delay: the longest time that a robot's status was ok with the truth outside [s].
+        strained: robots that end ok and need more than half of the bound; strained_silent: silent ones among them.
+    """
+
+    flagged: int
+    right: int
+    silent: int
+    away: float
+    delay: float
+    strained: int
+    strained_silent: int
+
+
+def simulated(task: Task, seeds: int) -> tuple[list[Trajectory], Tensor]:
+    """One run per seed, and the robots' goals."""
+    runs, goals = [], []
+    for sequence in torch.arange(seeds).tolist():
+        generator = torch.Generator().manual_seed(sequence)
+
+        def uniform(*shape: int, generator: torch.Generator = generator) -> Tensor:
+            return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+        turn = 2 * math.pi * (torch.arange(ROBOTS) + 0.6 * uniform(ROBOTS)) / ROBOTS
+        circle = torch.stack([turn.cos(), turn.sin()], dim=-1)
+        goal = -circle * (1.6 + 0.6 * uniform(ROBOTS, 1)) + 0.3 * (uniform(ROBOTS, 2) - 0.5)
+        controller = CbfQpController(task, [AVOIDANCE])
+        runs.append(simulate(controller, goal, 2.0 * circle, dt=DT, steps=STEPS, obstacles=PILLARS))
+        goals.append(goal)
+    return runs, torch.cat(goals)
+
+
+def measured(runs: Sequence[Trajectory], error: float) -> list[Measurement]:
+    """The robots of all runs as one batch, with errors of this size [m/s] in their velocities."""
+    generator = torch.Generator().manual_seed(len(runs))
+    noisy = []
+    for run in runs:
+        turn = 2 * math.pi * torch.rand(run.u.shape[:2], generator=generator, dtype=torch.float64)
+        away = torch.stack([turn.cos(), turn.sin()], dim=-1)
+        away[:, ROBOTS:] = 0.0
+        noisy.append(replace(run, u=run.u + error * away))
+    return [joined([run.measurement(k) for run in noisy]) for k in range(STEPS + 1)]
+
+
+def joined(teams: Sequence[Measurement]) -> Measurement:
+    columns: dict[str, Any] = {}
+    for field in fields(Measurement):
+        values = [getattr(team, field.name) for team in teams]
+        columns[field.name] = torch.cat(values) if isinstance(values[0], Tensor) else values[0]
+    return Measurement(**columns)
+
+
+def ending(belief: Belief, samples: list[Measurement], goals: Tensor, noise: NoiseBound) -> Ending:
+    """Observe all runs with a belief."""
+    observer = SetMembershipObserver(belief.task, belief.barriers, prior(goals), noise=noise)
+    has_truth = isinstance(belief.task, GoalTask)
+    steps = torch.zeros(len(goals))
+    for sample in samples:
+        observer.update(sample)
+        steps += (observer.status == Status.OK) & ~(observer.feasible_set.contains(goals) & has_truth)
+    ok = observer.status == Status.OK
+    silent = ok & ~(observer.feasible_set.contains(goals) & has_truth)
+    away = torch.where(silent, (observer.feasible_set.project(goals) - goals).norm(dim=-1), 0.0)
+    consistency = Consistency(
+        samples, belief.task, belief.barriers, prior(goals), neighbour_velocity=noise.neighbour_velocity
+    )
+    _, relaxed = consistency.sets(torch.as_tensor(noise.velocity).expand(len(goals)) / 2)
+    return Ending(
+        flagged=int((~ok).sum()),
+        right=int((ok & ~silent).sum()),
+        silent=int(silent.sum()),
+        away=float(away.max()),
+        delay=DT * float(steps.max()),
+        strained=int((ok & ~relaxed).sum()),
+        strained_silent=int((silent & ~relaxed).sum()),
+    )
+
+
+def prior(goals: Tensor) -> FeasibleSet:
+    reach = torch.full_like(goals, 6.0)
+    return FeasibleSet.from_box(-reach, reach)
+
+
+def automatic(belief: Belief, samples: list[Measurement], goals: Tensor, neighbour_velocity: float) -> NoiseBound:
+    """What `velocity: auto` takes for each run, for all its robots."""
+    consistency = Consistency(
+        samples, belief.task, belief.barriers, prior(goals), neighbour_velocity=neighbour_velocity
+    )
+    smallest = consistency.smallest_bounds(consistency.fastest).unflatten(0, (-1, ROBOTS)).amax(-1)
+    # Where there is no such bound the command ends with an error, which is as good as a flag: take what is refuted.
+    smallest = torch.where(smallest.isfinite(), smallest, 0.0)
+    return NoiseBound(AUTO_FACTOR * smallest.repeat_interleave(ROBOTS), neighbour_velocity=neighbour_velocity)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m experiments.studies.wrong_models")
+    parser.add_argument("--seeds", type=int, default=12, help="runs per model and bound")
+    parser.add_argument("--auto", action="store_true", help="take the bound that velocity: auto would")
+    chosen = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    runs = {task: simulated(task, chosen.seeds) for task in (TASK, SATURATED)}
+    heads = "model", "bound", "errors", "flagged", "ok, inside", "ok, outside", "strained", "away", "silent for"
+    print(f"| {' | '.join(heads)} |\n|{'---|' * len(heads)}")
+    for belief in BELIEFS:
+        trajectories, goals = runs[belief.run]
+        for bound, size in LEVELS:
+            errors = belief.errors * size if size else (belief.errors - 1.0) * bound
+            samples = belief.seen(measured(trajectories, errors))
+            declared = NoiseBound(bound, neighbour_velocity=bound)
+            label = f"{bound:g}"
+            if chosen.auto:
+                declared = automatic(belief, samples, goals, bound)
+                label = f"{float(torch.as_tensor(declared.velocity).median()):.2g}"
+            found = ending(belief, samples, goals, declared)
+            counts = f"{found.flagged} | {found.right} | {found.silent} | {found.strained} ({found.strained_silent})"
+            away = f"{found.away:.2g}" if found.silent else ""
+            print(f"| {belief.name} | {label} | {errors:g} | {counts} | {away} | {found.delay:.3g} |", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

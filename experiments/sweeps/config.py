@@ -1,0 +1,166 @@
+"""The files of `python -m experiments sweep`: many runs of a scene, over a grid, with random teams.
+
+`experiment` is a scene (`experiments.runs.config`) without what the sweep fills in: `title`, `seed`, `snapshots`, and,
+where a `team` is to be drawn, `robots` and `obstacles`. Every point of the grid is run `repeats` times. Run i draws all
+that is random from child i of one `numpy.random.SeedSequence`: it is the same run in whatever order, on however many
+workers. No torch in this module.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections import ChainMap
+from collections.abc import Iterable
+from functools import cached_property
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from experiments.runs.config import SceneConfig, Text, WholeNumber, require_increasing
+from experiments.teams import TeamConfig
+from torchfsid.config.documents import Strict, apply_overrides, validate, wrong
+from torchfsid.config.quantities import NonNegative, Number
+from torchfsid.errors import ConfigError
+
+MAX_RUNS = 1_000_000
+"""More is a slip of the pen in the grid."""
+
+FILLED_IN = ("title", "seed", "snapshots")
+
+Count = Annotated[int, Field(strict=True, ge=1)]
+FromTo = Annotated[tuple[Number, ...], Field(min_length=2, max_length=2)]
+
+
+class SweepConfig(Strict):
+    """A sweep.
+
+    Attributes:
+        seed: of everything random. repeats: runs per point of the grid.
+        times: at which sizes and errors are kept [s].
+        experiment: the scene, see above; keys of it are written with dots, as in `barriers.0.safety_distance`.
+        draw: keys of the experiment that each run draws uniformly between two numbers.
+        grid: keys of the experiment, and the values that they take. Keys joined by commas take theirs together: each
+            entry is then a list, one value per key. The first line of the grid is the one that figures compare.
+    """
+
+    kind: Literal["sweep"]
+    title: Text
+    seed: WholeNumber
+    repeats: Count
+    times: Annotated[tuple[NonNegative, ...], Field(min_length=1)]
+    experiment: dict[str, Any]
+    draw: dict[str, FromTo] = Field(default_factory=dict)
+    grid: dict[str, Annotated[list[Any], Field(min_length=1)]] = Field(default_factory=dict)
+
+    @property
+    def runs(self) -> int:
+        return len(self.points) * self.repeats
+
+    @cached_property
+    def axes(self) -> list[list[dict[str, Any]]]:
+        """The lines of the grid: for each of its entries a value for each of its keys."""
+        return [[_level(keys, values) for values in entries] for keys, entries in self.grid.items()]
+
+    @cached_property
+    def points(self) -> list[dict[str, Any]]:
+        """The grid: a value for each of its keys, point by point."""
+        return [dict(ChainMap(*reversed(levels))) for levels in itertools.product(*self.axes)]
+
+    def point(self, run: int) -> dict[str, Any]:
+        return self.points[run // self.repeats]
+
+    def scene(self, run: int) -> SceneConfig:
+        """What run number `run` (from 0) is. Raises `ConfigError` if that is not a scene."""
+        return validate(self.scene_mapping(run), SceneConfig, f"experiment of run {run}{_told(self.point(run))}")
+
+    def scene_mapping(self, run: int) -> dict[str, Any]:
+        """The same, not yet validated."""
+        values = {**self.point(run), **self.drawn(run)}
+        mapping = apply_overrides(self.experiment, [f"{key}={json.dumps(value)}" for key, value in values.items()])
+        _, placing, measuring = self._seeds(run)
+        if "team" in mapping:
+            team = validate({"team": mapping.pop("team")}, _Team, "experiment").team
+            mapping |= team.draw(np.random.default_rng(placing))
+        seed = int(measuring.generate_state(1, np.uint64)[0])
+        return {**mapping, "title": self.title, "seed": seed, "snapshots": [0.0]}
+
+    def drawn(self, run: int) -> dict[str, float]:
+        """What this run draws."""
+        random = np.random.default_rng(self._seeds(run)[0])
+        return {key: float(random.uniform(low, high)) for key, (low, high) in self.draw.items()}
+
+    def check_runs(self, source: str) -> None:
+        """Raises `ConfigError` if the first run of some point of the grid is not a scene."""
+        for run in range(0, self.runs, self.repeats):
+            try:
+                scene = self.scene(run)
+            except ConfigError as error:
+                raise ConfigError(f"{source}: {error}") from error
+            if self.times[-1] > scene.duration:
+                raise ConfigError(
+                    f"{source}: times: must not be after the end, {scene.duration} s, got {self.times[-1]}"
+                )
+
+    def _seeds(self, run: int) -> list[np.random.SeedSequence]:
+        """For drawing, for placing the team, for measuring."""
+        return np.random.SeedSequence(self.seed, spawn_key=(run,)).spawn(3)
+
+    @model_validator(mode="after")
+    def _is_a_grid(self) -> SweepConfig:
+        require_increasing(self.times, "times")
+        for joined, entries in self.grid.items():
+            count = len(_keys(joined))
+            for i, entry in enumerate(entries):
+                if count > 1 and not (isinstance(entry, list) and len(entry) == count):
+                    raise wrong(f"expected {count} values, one per key, got {entry!r}", f"grid.{joined}[{i}]")
+        keys = [*itertools.chain(*map(_keys, self.grid)), *self.draw]
+        if repeated := [key for i, key in enumerate(keys) if key in keys[:i]]:
+            raise wrong(f"{repeated[0]} is varied twice", "grid, draw")
+        for key, (low, high) in self.draw.items():
+            if low > high:
+                raise wrong(f"expected the smaller number first, got {[low, high]}", f"draw.{key}")
+        if taken := [key for key in FILLED_IN if key in self.experiment or key in keys]:
+            raise wrong("the sweep fills it in", f"experiment.{taken[0]}")
+        if "team" in self.experiment and (given := {"robots", "obstacles"} & self.experiment.keys()):
+            raise wrong("a team is drawn: leave it out", f"experiment.{min(given)}")
+        if self.runs > MAX_RUNS:
+            raise wrong(f"expected at most {MAX_RUNS} runs, got {self.runs}", "repeats, grid")
+        return self
+
+
+class _Team(Strict):
+    team: TeamConfig
+
+
+def override_sweep(mapping: dict[Any, Any], overrides: Iterable[str]) -> dict[Any, Any]:
+    """`apply_overrides` for a sweep: what follows `draw.` or `grid.` is one key, dots and commas included, as in
+    "draw.task.gain=[1, 2]". Raises `ConfigError` as that does."""
+    for override in overrides:
+        path, _, text = override.partition("=")
+        section, dot, joined = path.partition(".")
+        section = section.strip()
+        if not (dot and section in ("draw", "grid") and _keys(joined)[0]):
+            mapping = apply_overrides(mapping, [override])
+            continue
+        value = apply_overrides({}, [f"{section}={text}"])[section]
+        lines = mapping.get(section) or {}
+        if not isinstance(lines, dict):
+            raise ConfigError(f"override {override!r}: {section} is no mapping")
+        same = next((key for key in lines if _keys(str(key)) == _keys(joined)), joined.strip())
+        mapping = {**mapping, section: {**lines, same: value}}
+    return mapping
+
+
+def _keys(joined: str) -> list[str]:
+    return [key.strip() for key in joined.split(",")]
+
+
+def _level(joined: str, values: Any) -> dict[str, Any]:
+    keys = _keys(joined)
+    return dict(zip(keys, [values] if len(keys) == 1 else values, strict=True))
+
+
+def _told(point: dict[str, Any]) -> str:
+    return f" ({', '.join(f'{key} = {value}' for key, value in point.items())})" if point else ""

@@ -1,0 +1,45 @@
+"""What has been finished, on disk: one line of JSON per run, appended and synced as runs finish, in whatever order.
+
+A process that is killed leaves at worst a last line without its end; it is cut off when the journal is opened again.
+Any other line that is not JSON (a damaged disk) is passed over. Either way its run is run again, and no whole line is
+ever touched.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from experiments.results import Appender
+
+
+class Journal(Appender):
+    """Use it as a context manager.
+
+    Attributes:
+        records: the whole lines, by run.
+    """
+
+    def __init__(self, path: Path):
+        super().__init__(path, keep=True)
+        self.file.seek(0)
+        *lines, rest = self.file.read().split(b"\n")
+        self.file.truncate(self.file.tell() - len(rest))
+        records = filter(None, map(_parse, lines))
+        self.records: dict[int, dict[str, Any]] = {record["run"]: record for record in records}
+
+    def add(self, record: dict[str, Any]) -> None:
+        """Once this returns, the record survives a crash."""
+        self.append(json.dumps(record, allow_nan=False) + "\n")
+        os.fsync(self.file.fileno())
+        self.records[record["run"]] = record
+
+
+def _parse(line: bytes) -> dict[str, Any] | None:
+    try:
+        record = json.loads(line)
+    except ValueError:
+        return None
+    return record if isinstance(record, dict) and isinstance(record.get("run"), int) else None

@@ -1,0 +1,133 @@
+"""What one run of a sweep leaves: a row of the table, and sizes and errors at some times.
+
+Sizes are the square root of the area, the diameter, and the distances of point estimates from the goal [m]. A set is
+lost from the first sample at which it does not hold the truth, in silence if its status ends as `ok`.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from experiments.runs.config import SceneConfig
+from experiments.runs.observers import Observers
+from experiments.runs.recording import SimulatedScene, simulate_scene
+from experiments.runs.saved import SETS
+from torchfsid.identification.active_set import active_set
+from torchfsid.identification.kkt import CASES, solve_kkt
+from torchfsid.observers.hybrid import HybridEstimate
+from torchfsid.observers.set_membership import Event, SetEstimate
+from torchfsid.outcome import Status
+from torchfsid.robots.barriers import stack_barriers
+from torchfsid.robots.measurement import Measurement
+
+EXACTLY_ACTIVE = 1e-9
+"""Distance to its boundary below which a row of the true controls is active [m/s]: round-off of the controller."""
+
+
+def observed(scene: SceneConfig, times: tuple[float, ...]) -> dict[str, Any]:
+    """Simulate and observe a scene: its `row`, its `series` at the samples nearest to `times`, its `seconds`."""
+    torch.set_num_threads(1)  # small tensors: more threads only wait for each other
+    began = time.perf_counter()
+    simulated = simulate_scene(scene)
+    recording = simulated.recording()
+    observers = Observers(scene, recording)
+    lost_since = {kind: torch.full((len(recording.robots),), math.nan, dtype=torch.float64) for kind in SETS}
+    kept = {round(t / scene.dt) for t in times}
+    cases = torch.zeros(len(CASES))
+    seen_right, series, sizes = 0, [], {}
+    for k, measurement in enumerate(recording.measurements):
+        estimate, sets = observers.update(measurement)
+        for kind, since in lost_since.items():
+            since[since.isnan() & (observers.tally.sets[kind].outside > 0)] = measurement.t
+        of_robots, active = _true_cases(simulated, simulated.true.measurement(k))
+        cases += torch.bincount(of_robots, minlength=len(CASES))
+        seen = active_set(
+            stack_barriers(recording.barriers, measurement), _control(measurement), scene.active_tolerance
+        )
+        seen_right += int((seen == active).all(-1).sum())
+        if k in kept or k == recording.samples - 1:
+            sizes = _sizes(estimate, sets, recording.goals)
+        if k in kept:
+            series += _series(measurement.time, recording.robots, sizes, sets, observers)
+    shares = (cases / cases.sum()).tolist()
+    stopped = [t for t in simulated.true.deadlocked_since.tolist() if not math.isnan(t)]
+    row = {
+        "robots": len(recording.robots),
+        "obstacles": len(scene.obstacles),
+        "infeasible_steps": int((~simulated.true.feasible).sum()),
+        "deadlocked": len(stopped),
+        "deadlocked_since": min(stopped, default=None),
+        **{f"case_{letter}": round(share, 6) for letter, share in zip(CASES, shares, strict=True)},
+        "active_set_seen": round(seen_right / float(cases.sum()), 6),
+    }
+    for kind in SETS:
+        row |= {f"{kind}_{name}": value for name, value in _of_set(observers, kind, lost_since[kind]).items()}
+    row |= {name: _rounded(float(values.nanmedian())) for name, values in sizes.items()}
+    return {"row": row, "series": series, "seconds": round(time.perf_counter() - began, 3)}
+
+
+def _true_cases(scene: SimulatedScene, exact: Measurement) -> tuple[Tensor, Tensor]:
+    """The paper's case of every robot, and the rows that are really active."""
+    rows = stack_barriers(scene.barriers, exact)
+    active = active_set(rows, _control(exact), EXACTLY_ACTIVE)
+    return solve_kkt(rows, active, *scene.task(exact)).case, active
+
+
+def _control(measurement: Measurement) -> Tensor:
+    assert measurement.u is not None
+    return measurement.u
+
+
+def _sizes(estimate: HybridEstimate, sets: dict[str, SetEstimate], goals: Tensor) -> dict[str, Tensor]:
+    """Of every robot, by name."""
+    sizes = {}
+    for kind in SETS:
+        theta = sets[kind].feasible_set
+        sizes[f"{kind}_sqrt_area"] = theta.volume().sqrt()
+        sizes[f"{kind}_diameter"] = theta.diameter()
+        sizes[f"{kind}_centroid_error"] = (sets[kind].theta - goals).norm(dim=-1)
+    sizes["ukf_error"] = (estimate.ukf_estimate.theta - goals).norm(dim=-1)
+    sizes["hybrid_error"] = (estimate.theta - goals).norm(dim=-1)
+    return sizes
+
+
+def _series(
+    t: float, robots: list[str], sizes: dict[str, Tensor], sets: dict[str, SetEstimate], observers: Observers
+) -> list[dict[str, Any]]:
+    columns: dict[str, list] = {"robot": robots}
+    for kind in SETS:
+        columns[f"{kind}_lost"] = (observers.tally.sets[kind].outside > 0).long().tolist()
+        columns[f"{kind}_status"] = [Status(of_robot).name.lower() for of_robot in sets[kind].status.tolist()]
+    columns |= {name: [_rounded(value) for value in values.tolist()] for name, values in sizes.items()}
+    return [
+        {"t": _rounded(t), **dict(zip(columns, of_robot, strict=True))}
+        for of_robot in zip(*columns.values(), strict=True)
+    ]
+
+
+def _of_set(observers: Observers, kind: str, lost_since: Tensor) -> dict[str, Any]:
+    observer, lost = observers.sets[kind], ~lost_since.isnan()
+    return {
+        "lost": int(lost.sum()),
+        "lost_since": _rounded(float(lost_since[lost].min())) if lost.any() else None,
+        "lost_and_inconsistent": int((lost & (observer.status == Status.INCONSISTENT)).sum()),
+        "lost_in_silence": int((lost & (observer.status == Status.OK)).sum()),
+        **_first(observer.events, Status.ALARM, "alarm"),
+        **_first(observer.events, Status.INCONSISTENT, "inconsistent"),
+    }
+
+
+def _first(events: list[Event], status: Status, name: str) -> dict[str, Any]:
+    """How many robots, and when the first."""
+    times = [event.t for event in events if event.status == status]
+    return {name: len(times), f"{name}_since": _rounded(min(times)) if times else None}
+
+
+def _rounded(value: float) -> float | None:
+    """Six digits: the tables are for people and figures. None if it is not finite."""
+    return float(f"{value:.6g}") if math.isfinite(value) else None

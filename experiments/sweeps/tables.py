@@ -1,0 +1,63 @@
+"""The tables of a sweep, from its journal, as CSV and Parquet; and read back. No torch in this module."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+
+from experiments.results import Columns, reading, whole
+from experiments.sweeps.config import SweepConfig
+
+
+def write_tables(out: Path, config: SweepConfig, records: list[dict[str, Any]]) -> None:
+    """runs, series and timings of the finished runs, each file whole or not at all."""
+    if not records:
+        return
+    varied = [_varied(config, record["run"]) for record in records]
+    runs = [
+        {"run": record["run"], "error": record["error"], **values, **record["row"]}
+        for record, values in zip(records, varied, strict=True)
+    ]
+    series = [{"run": record["run"], **row} for record in records for row in record["series"]]
+    for name, rows in (("runs", runs), ("series", series)):
+        table = _table(rows)
+        with whole(out / f"{name}.csv") as path:
+            pyarrow.csv.write_csv(table, path)
+        with whole(out / f"{name}.parquet") as path:
+            pyarrow.parquet.write_table(table, path)
+    timings = _table([{"run": record["run"], "seconds": record["seconds"]} for record in records])
+    with whole(out / "timings.csv") as path:
+        pyarrow.csv.write_csv(timings, path)
+
+
+def read_table(path: Path) -> Columns:
+    """The columns of a Parquet file; numbers that are missing are NaN."""
+    with reading(path):
+        table = pyarrow.parquet.read_table(path)
+        return Columns(path, {name: table[name].to_numpy() for name in table.column_names})
+
+
+def _varied(config: SweepConfig, run: int) -> dict[str, Any]:
+    """What the grid and the drawing gave this run; lists and the like as JSON."""
+    values = {**config.point(run), **config.drawn(run)}
+    return {key: value if isinstance(value, int | float | str) else json.dumps(value) for key, value in values.items()}
+
+
+def _table(rows: list[dict[str, Any]]) -> pa.Table:
+    """Columns in the order in which they first come; a row may lack some (a run that failed)."""
+    names = dict.fromkeys(["run", *(name for row in rows for name in row)])
+    return pa.table({name: _column([row.get(name) for row in rows]) for name in names})
+
+
+def _column(values: list[Any]) -> pa.Array:
+    """Numbers, or text where not all are numbers."""
+    if all(value is None for value in values):
+        return pa.array(values, pa.float64())
+    if all(isinstance(value, int | float | None) for value in values):
+        return pa.array(values)
+    return pa.array([value if isinstance(value, str | None) else json.dumps(value) for value in values])

@@ -1,0 +1,124 @@
+"""The figure of an observed log: any names, any sizes, and one clear line where a file is missing or damaged."""
+
+import csv
+import json
+import math
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from torchfsid.commands import figures
+from torchfsid.commands.figures import MOST_POINTS, draw_observation
+from torchfsid.errors import FigureError
+
+TIMES = 5
+
+
+@pytest.fixture(autouse=True)
+def _no_warnings() -> Iterator[None]:
+    """Nothing is to be said about glyphs, logarithms or layouts."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        yield
+
+
+def write_results(
+    out: Path, robots: Sequence[str], times: int = TIMES, diameter: float | str = 0.5, **region: Any
+) -> tuple[np.ndarray, np.ndarray, Sequence[str]]:
+    """A results folder, and what else a figure takes."""
+    final = {"vertices": [[0, 0], [1, 0], [0, 1]], "centroid": [1 / 3, 1 / 3], "diameter": math.sqrt(2), **region}
+    (out / "regions.json").write_text(json.dumps({"robots": dict.fromkeys(robots, final)}), encoding="utf-8")
+    with (out / "estimates.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["t", "robot", "case", "diameter"])
+        for k in range(times):
+            writer.writerows([0.1 * k, robot, "ABCDE"[k % 5] if k else "", diameter] for robot in robots)
+    x = np.cumsum(np.ones((times, len(robots), 2)), axis=0)
+    return x, np.ones((times, len(robots)), dtype=bool), list(robots)
+
+
+def draw(out: Path, robots: Sequence[str], **options: Any) -> None:
+    paths = draw_observation(out, *write_results(out, robots, **options))
+    assert [path.name for path in paths] == ["regions.png", "regions.pdf"]
+    assert (out / "regions.png").read_bytes().startswith(b"\x89PNG")
+    assert (out / "regions.pdf").read_bytes().rstrip().endswith(b"%%EOF")
+
+
+def test_names_of_every_kind(tmp_path: Path) -> None:
+    draw(tmp_path, ["机器人", "روبوت", "$x_{", "_hidden", "r" * 300, "a\nb", "🤖", "[bold]"])
+
+
+def test_more_robots_than_a_legend_holds(tmp_path: Path) -> None:
+    draw(tmp_path, [f"r{i}" for i in range(25)], times=2)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"diameter": 0.0, "vertices": [[1.0, 1.0]], "centroid": [1.0, 1.0]},
+        {"diameter": "", "vertices": [[0, 0], [1, 0], [0, 1]], "centroid": [None, None]},
+        {"vertices": [[0, 0, 0], [1, 0, 0], [0, 1, 1]], "centroid": [0.1, 0.2, 0.3]},
+        {"times": 1},
+    ],
+    ids=["points", "empty sets", "not planar", "one sample"],
+)
+def test_sets_of_every_kind(tmp_path: Path, options: dict[str, Any]) -> None:
+    draw(tmp_path, ["a", "b"], **options)
+
+
+def test_long_logs_are_thinned_and_end_where_they_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, file, format: (drawn.append(figure), file.write(b"x")))
+    times = 3 * MOST_POINTS + 1
+    x, seen, bodies = write_results(tmp_path, ["a"], times=times)
+    draw_observation(tmp_path, x, seen, bodies)
+    lines = [line for axes in drawn[0].axes for line in axes.lines if len(line.get_xdata()) > 1]
+    assert len(lines) == 2
+    for line, last in zip(lines, (float(x[-1, 0, 0]), 0.1 * (times - 1)), strict=True):
+        assert len(line.get_xdata()) <= MOST_POINTS
+        assert line.get_xdata()[-1] == pytest.approx(last)
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "expected"),
+    [
+        ("estimates.csv", lambda text: None, "No such file"),
+        ("estimates.csv", lambda text: "", "missing or damaged"),
+        ("estimates.csv", lambda text: text.replace("diameter", "dia"), "missing or damaged"),
+        ("estimates.csv", lambda text: text.rstrip()[:-4], "missing or damaged"),
+        ("estimates.csv", lambda text: text.replace("0.5", "x", 1), "could not convert string to float: 'x'"),
+        ("estimates.csv", lambda text: text.replace(",A,", ",Z,"), "missing or damaged"),
+        ("estimates.csv", lambda text: text + "9,b,A,1\n", "not the same times"),
+        ("estimates.csv", lambda text: text.splitlines()[0] + "\n", "not the same times, or none"),
+        ("regions.json", lambda text: None, "No such file"),
+        ("regions.json", lambda text: text[:-5], "missing or damaged"),
+        ("regions.json", lambda text: text.replace("centroid", "centre"), "'centroid'"),
+        ("regions.json", lambda text: "[]", "missing or damaged"),
+    ],
+)
+def test_what_is_missing_or_damaged_is_named(tmp_path: Path, file: str, change, expected: str) -> None:
+    arguments = write_results(tmp_path, ["a", "b"], times=6)
+    changed = change((tmp_path / file).read_text())
+    (tmp_path / file).unlink()
+    if changed is not None:
+        (tmp_path / file).write_text(changed)
+    with pytest.raises(FigureError) as error:
+        draw_observation(tmp_path, *arguments)
+    assert str(error.value).startswith(f"{tmp_path / file}: ")
+    assert expected in str(error.value)
+    assert str(error.value).isprintable()
+    assert not (tmp_path / "regions.png").exists()
+
+
+def test_what_the_plotting_library_says_is_said_as_ours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*arguments: object) -> None:
+        raise RuntimeError("no\nbackend")
+
+    monkeypatch.setattr(figures, "_draw_map", fail)
+    with pytest.raises(FigureError, match=r"regions\.png: not drawn: no backend"):
+        draw_observation(tmp_path, *write_results(tmp_path, ["a"]))

@@ -1,0 +1,128 @@
+"""A log and the declared model, checked against each other: what every command needs before it can begin."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from copy import copy
+from dataclasses import dataclass, field, replace
+
+from torchfsid.config.observe import ObserveConfig
+from torchfsid.errors import ConfigError
+from torchfsid.logs.gaps import bridged
+from torchfsid.logs.log import Log
+from torchfsid.observers.consistency import Consistency
+from torchfsid.robots.barriers import Barrier
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.tasks import Task
+from torchfsid.sets.feasible_set import FeasibleSet
+
+AUTO_FACTOR = 2.0
+"""`noise.velocity: auto` takes the smallest bound that explains the log this many times: the worst error of a log is
+not the worst there is, and part of an error may look like another parameter."""
+
+
+@dataclass
+class DeclaredLog:
+    """A log and the model that its configuration declares.
+
+    Attributes:
+        log: with differences of its positions for velocities, if the configuration says so, and without gaps (`gaps`).
+        robots: the bodies to infer. task, barriers: the model. prior: the robots' prior sets.
+
+    Raises:
+        ConfigError: the model needs what the log does not have (a body, velocities, radii, planar positions).
+    """
+
+    config: ObserveConfig
+    log: Log
+    robots: list[str] = field(init=False)
+    task: Task = field(init=False)
+    barriers: list[Barrier] = field(init=False)
+    prior: FeasibleSet = field(init=False)
+
+    def __post_init__(self) -> None:
+        config = self.config
+        if self.log.x.shape[-1] != 2:
+            raise ConfigError("task: planar controllers only, but the log has a column z")
+        if config.velocity == "logged" and self.log.u is None:
+            raise ConfigError("velocity: 'logged', but the log has no velocities vx, vy (use 'differentiated')")
+        for declared in config.barriers:
+            declared.require_radii(None if self.log.radius is None else self.log.radius.tolist())
+        if len(self.log.bodies) > 1 and not (self.log.seen.sum(axis=1) > 1).any():
+            raise ConfigError(f"{self.log.source}: no two bodies share a time, so none would ever see another")
+        if config.velocity == "differentiated":
+            self.log = self.log.differentiated()
+        self.log = bridged(self.log)
+        self.robots = config.robots(self.log.bodies)
+        self.task = config.task.build(self.log.bodies)
+        self.barriers = [barrier.build(self.log.bodies) for barrier in config.barriers]
+        self.prior = config.prior.build(len(self.robots))
+
+    @property
+    def row_labels(self) -> list[str]:
+        """A name for each row of the model."""
+        return [label for barrier in self.barriers for label in barrier.labels(self.log.bodies)]
+
+    def measurements(self) -> Iterator[Measurement]:
+        """The samples of the robots."""
+        return self.log.measurements(self.robots, self.config.neighbour_velocities, self.config.required)
+
+    def consistency(self) -> Consistency:
+        """What the log says about the errors, under the model and all declared bounds but that on the velocity."""
+        noise = self.config.noise
+        return Consistency(
+            list(self.measurements()),
+            self.task,
+            self.barriers,
+            self.prior,
+            noise.slack,
+            noise.position,
+            noise.neighbour_velocity,
+        )
+
+    def shifted(self, samples: int) -> DeclaredLog:
+        """The same in which the velocities of a sample are those logged so many samples later."""
+        log, times = self.log, len(self.log.t)
+        kept = slice(max(0, -samples), times - max(0, samples))
+        moved = slice(max(0, samples), times + min(0, samples))
+        shifted = replace(
+            log,
+            t=log.t[kept],
+            x=log.x[kept],
+            u=None if log.u is None else log.u[moved],
+            seen=log.seen[kept],
+            velocity_known=log.velocity_known[moved] & log.seen[kept],
+            position_error=None if log.position_error is None else log.position_error[kept],
+            velocity_error=None if log.velocity_error is None else log.velocity_error[moved],
+            lost=None if log.lost is None else log.lost[kept],
+            bridged=None if log.bridged is None else log.bridged[kept] | log.bridged[moved],
+        )
+        return replace(self, config=self.config.model_copy(update={"velocity": "logged"}), log=shifted)
+
+    def with_velocity_bound(self, bound: float) -> DeclaredLog:
+        """The same with another `noise.velocity` [m/s]."""
+        other = copy(self)
+        other.config = self.config.with_velocity_bound(bound)
+        return other
+
+    def smallest_bounds(self) -> dict[str, float]:
+        """For each robot the smallest velocity bound with which the model explains its motion [m/s]; infinite if none
+        up to the largest speed in the log does."""
+        consistency = self.consistency()
+        return dict(zip(self.robots, consistency.smallest_bounds(consistency.fastest).tolist(), strict=True))
+
+
+def automatic_bound(smallest: Mapping[str, float]) -> float:
+    """What `noise.velocity: auto` takes, given the robots' smallest bounds [m/s].
+
+    Raises:
+        ConfigError: one of them is infinite.
+    """
+    unexplained = [robot for robot, bound in smallest.items() if bound == math.inf]
+    if unexplained:
+        raise ConfigError(
+            f"noise.velocity: auto: no bound up to the largest speed in the log explains robot {unexplained[0]!r}; "
+            "the model is wrong (torchfsid check says where)"
+        )
+    return AUTO_FACTOR * max(smallest.values())

@@ -1,0 +1,92 @@
+"""The two commands, from the path of a log to the last line that is printed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import nullcontext
+from functools import partial
+from pathlib import Path
+
+from torchfsid.commands import report
+from torchfsid.commands.check import check
+from torchfsid.commands.command_line import use_one_thread
+from torchfsid.commands.declared_log import AUTO_FACTOR, DeclaredLog
+from torchfsid.commands.figures import draw_observation
+from torchfsid.commands.hypotheses import Hypotheses
+from torchfsid.commands.observe import Observation
+from torchfsid.commands.results_folder import ResultsFolder, write_json, write_whole
+from torchfsid.commands.terminal import console, status, track
+from torchfsid.config.documents import dump
+from torchfsid.config.models import dump_models
+from torchfsid.config.observe import ObserveConfig
+from torchfsid.errors import FigureError
+from torchfsid.logs.read import read_log
+
+FILES = ("estimates.csv", "regions.json", "regions.png", "regions.pdf")
+"""What an observation leaves beside config.yaml."""
+
+CHECKED = "check.json"
+
+
+def observe_log(path: Path, models: Mapping[str, ObserveConfig], folder: ResultsFolder) -> None:
+    """`torchfsid observe`: infer the sets of a log's robots, under one model or under each of several hypotheses.
+
+    What cannot be written or drawn is reported at the end: everything else is done before.
+    """
+    use_one_thread()
+    log = read_log(path, next(iter(models.values())).bag)
+    run = _ready({name: DeclaredLog(model, log) for name, model in models.items()})
+    of_each = run.observations if isinstance(run, Hypotheses) else {"": run}
+    files = [f"{name}/{file}" if name else file for name in of_each for file in ("config.yaml", *FILES)]
+    also = ["velocity_bound.json", *(["hypotheses.json"] if isinstance(run, Hypotheses) else [])]
+    folder.claim([*files, *also], dump_models({name: of.config for name, of in of_each.items()}))
+    if run.smallest_bounds is not None:
+        found = {"smallest": run.smallest_bounds, "factor": AUTO_FACTOR, "used": run.velocity_bound}
+        write_json(folder.path / "velocity_bound.json", found)
+    problems: list[OSError | FigureError] = []
+    for name, observation in of_each.items():
+        out = folder.path / name
+        try:
+            if name:
+                out.mkdir(exist_ok=True)
+                write_whole(out / "config.yaml", dump(observation.config))
+            observation.run(out, partial(track, what=f"Observing {name}".strip(), total=observation.samples))
+            with status("Drawing"):
+                seen = observation.log
+                draw_observation(out, seen.x, seen.seen, seen.bodies)
+        except (OSError, FigureError) as problem:
+            problems.append(problem)
+    if isinstance(run, Hypotheses):
+        try:
+            run.write_verdicts(folder.path)
+        except OSError as problem:
+            problems.append(problem)
+        report.print_hypotheses(run, folder.path, console())
+    else:
+        report.print_verdicts(run, folder.path, console())
+    if problems:
+        raise problems[0]
+
+
+def check_log(path: Path, models: Mapping[str, ObserveConfig], folder: ResultsFolder | None) -> None:
+    """`torchfsid check`: does a log fit the model, or each of the hypotheses, that is declared for it?"""
+    use_one_thread()
+    log = read_log(path, next(iter(models.values())).bag)
+    declared = {name: DeclaredLog(model, log) for name, model in models.items()}
+    with status("Checking", computes=True):
+        found = {name: check(model) for name, model in declared.items()}
+    if folder is not None:
+        folder.claim([f"{name}/{CHECKED}" if name else CHECKED for name in found])
+        for name, of_model in found.items():
+            (folder.path / name).mkdir(exist_ok=True)
+            write_json(folder.path / name / CHECKED, of_model.to_json())
+    shown = console()
+    for name, of_model in found.items():
+        report.print_check(of_model, name, shown)
+
+
+def _ready(models: Mapping[str, DeclaredLog]) -> Observation | Hypotheses:
+    first = next(iter(models.values()))
+    finding = status("Finding the velocity bound", computes=True)
+    with finding if first.config.noise.velocity == "auto" else nullcontext():
+        return Hypotheses(models) if len(models) > 1 else Observation(first)

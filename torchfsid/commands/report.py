@@ -1,0 +1,131 @@
+"""What the commands print: a line per robot, and in words what follows from it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+
+from torchfsid.commands.check import Check
+from torchfsid.commands.hypotheses import Hypotheses, HypothesisVerdict
+from torchfsid.commands.observe import Observation, Verdict
+from torchfsid.commands.results import seconds
+from torchfsid.commands.terminal import digits, table
+
+
+def print_verdicts(observation: Observation, out: Path, console: Console) -> None:
+    """What became of each robot's set."""
+    numbers = ("skipped", "volume", "diameter", "centroid", "centre", "radius", "shrank last")
+    verdicts = table(
+        f"{len(observation.log.t)} samples, set: {observation.config.set}", ["robot", "cases"], [*numbers, "status"]
+    )
+    verdicts.columns[-1].justify = "left"
+    for verdict in observation.verdicts():
+        since = verdict.no_information_since
+        resets = "".join(f", reset at {seconds(t)}" for t in verdict.resets)
+        verdicts.add_row(
+            escape(verdict.robot),
+            " ".join(f"{case}:{count}" for case, count in verdict.cases.items() if count),
+            str(verdict.skipped),
+            _size(verdict.volume),
+            _size(verdict.diameter),
+            _point(verdict.centroid, verdict),
+            _point(verdict.centre, verdict),
+            _size(verdict.radius),
+            "never" if since is None else seconds(since),
+            _status(verdict.status) + resets,
+        )
+    console.print(verdicts)
+    _print_bound(console, observation.smallest_bounds, observation.velocity_bound)
+    if strained := observation.strained():
+        console.print(
+            f"More than half of noise.velocity, {observation.velocity_bound:g} m/s, is needed by "
+            f"{escape(', '.join(strained))}: if the errors are not that large, the model is wrong (torchfsid check)"
+        )
+    files = ("estimates.csv", "regions.json", "config.yaml", "regions.png", "regions.pdf")
+    there = ", ".join(file for file in files if (out / file).exists())
+    console.print(escape(f"Results: {out}/{there}"))
+
+
+def print_hypotheses(hypotheses: Hypotheses, out: Path, console: Console) -> None:
+    """Which hypotheses are left for each robot, and what refuted the others."""
+    names = list(hypotheses.observations)
+    verdicts = table("which task is it?", ["robot", *names, "left"])
+    for robot, of_robot in hypotheses.verdicts().items():
+        cells, left = [], []
+        for name in names:
+            verdict = of_robot.get(name)
+            if verdict is None:
+                cells.append("-")
+            elif verdict.refuted_at is not None:
+                cells.append(f"refuted at {seconds(verdict.refuted_at)} by {' / '.join(_rows(verdict))}")
+            else:
+                left.append(name)
+                alarm = "" if verdict.status == "ok" else f", {_status(verdict.status)}"
+                cells.append(f"possible, volume {_size(verdict.volume)}{alarm}")
+        verdicts.add_row(escape(robot), *cells, ", ".join(left) or "[bold red]none[/]")
+    console.print(verdicts)
+    _print_bound(console, hypotheses.smallest_bounds, hypotheses.velocity_bound)
+    console.print(escape(f"Results: {out}/hypotheses.json, and a folder for each of {', '.join(names)}"))
+
+
+def print_check(found: Check, name: str, console: Console) -> None:
+    """The smallest bounds, what is at odds with the declared ones, and the conclusions; `name` of a hypothesis."""
+    robots = table(
+        "smallest velocity bound and residuals [m/s]", ["robot"], ["bound", "median", "p95", "max", "at", "samples"]
+    )
+    faults = table(
+        f"at odds with the declared bounds, velocity {found.declared:.3g} m/s",
+        ["robot", "what", "row"],
+        ["samples", "first", "worst [m/s]"],
+    )
+    for robot in found.robots:
+        sizes = [_size(size) for size in (robot.smallest_bound, robot.median, robot.p95, robot.worst)]
+        robots.add_row(
+            escape(robot.robot),
+            *sizes,
+            "-" if math.isnan(robot.worst_time) else seconds(robot.worst_time),
+            str(robot.samples),
+        )
+        for what, listed in (("unexplained", robot.contradictions), ("violated", robot.violations)):
+            for fault in listed:
+                row = escape(f"{fault.row} (soft)" if fault.soft else fault.row)
+                size = [str(fault.samples), seconds(fault.first), f"{fault.worst:.3g}"]
+                faults.add_row(escape(robot.robot), what, row, *size)
+    if name:
+        console.print(f"[bold]{name}[/]")
+    console.print(robots)
+    if faults.row_count:
+        console.print(faults)
+    for conclusion in found.conclusions():
+        console.print(f"- {escape(conclusion)}", soft_wrap=True)
+
+
+def _print_bound(console: Console, smallest: Mapping[str, float] | None, used: float) -> None:
+    if smallest is not None:
+        robot = max(smallest, key=lambda robot: smallest[robot])
+        console.print(
+            escape(f"noise.velocity: auto found {smallest[robot]:.3g} m/s (robot {robot}), takes {used:.3g} m/s")
+        )
+
+
+def _rows(verdict: HypothesisVerdict) -> list[str]:
+    """The rows of the evidence, each once."""
+    return [escape(row) for row in dict.fromkeys(row for _, row in verdict.evidence)]
+
+
+def _status(status: str) -> str:
+    return status if status == "ok" else f"[bold red]{status}[/]"
+
+
+def _size(value: float) -> str:
+    """A size; a dash where there is none, as of an empty set."""
+    return "-" if math.isnan(value) else f"{value:.3g}"
+
+
+def _point(values: Sequence[float], verdict: Verdict) -> str:
+    """Digits enough to find the point within its set."""
+    return "(" + ", ".join(digits(value, verdict.diameter) for value in values) + ")"

@@ -1,0 +1,183 @@
+"""The results folder: one owner at a time, never two runs mixed, and no file that is half written.
+
+A folder belongs to the kind of command whose config.yaml it holds: `observe`, or the `kind` of an experiment. The file
+`.torchfsid` lists what was written there, a name a line, so that the next run of the same kind removes exactly that and
+nothing of anybody else's; it is locked as long as a command writes.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path, PurePosixPath
+from typing import Any, BinaryIO
+
+from torchfsid.errors import ConfigError
+
+try:
+    import fcntl
+except ImportError:  # Windows: nobody keeps two commands apart there
+    fcntl = None
+
+MANIFEST = ".torchfsid"
+
+OBSERVE = "observe"
+"""The kind of a folder whose config.yaml has no `kind`."""
+
+
+class ResultsFolder:
+    """A folder that one command writes to.
+
+    Args:
+        path: the folder; `claim` makes it.
+        kind: whose results it holds; None: any folder will do (the command adds files of its own to what is there).
+
+    Attributes:
+        claimed: this command writes there now.
+    """
+
+    def __init__(self, path: Path, kind: str | None):
+        self.path, self.kind = path, kind
+        self._lock: BinaryIO | None = None
+
+    @property
+    def claimed(self) -> bool:
+        return self._lock is not None
+
+    def require_ours(self) -> None:
+        """Refuse a folder that is none, or that holds something else. Costs nothing: ask before the work begins.
+
+        Raises:
+            ConfigError: `path` is not a folder, or holds the results of another kind of command.
+        """
+        if self.path.exists() and not self.path.is_dir():
+            raise ConfigError(f"--out: {self.path} is not a folder")
+        held = self._kind_held()
+        if self.kind is not None and held not in (None, self.kind):
+            what = f"the results of '{held}'" if held else "a config.yaml that is not of a run"
+            raise ConfigError(f"{self.path}: holds {what}; choose another --out, or remove it")
+
+    def claim(self, files: Iterable[str], config: str | None = None, resume: bool = False) -> None:
+        """Become the owner, remove what an earlier run left, and write config.yaml before anything else.
+
+        Args:
+            files: names of everything that will be written, relative to the folder, "/" before a file of a subfolder.
+            config: the content of config.yaml.
+            resume: go on with what is there, if its config.yaml is the same.
+
+        Raises:
+            ConfigError: see `require_ours`; or another command is writing there, or `resume` finds another config.
+            OSError: the folder cannot be made or written to.
+        """
+        self.require_ours()
+        self.path.mkdir(parents=True, exist_ok=True)
+        lock = (self.path / MANIFEST).open("a+b")
+        try:
+            _lock(lock, self.path)
+            self.require_ours()
+            if resume and config is not None and _text(self.path / "config.yaml") not in (None, config):
+                raise ConfigError(f"{self.path}: holds another {self.kind}; choose another --out, or remove it")
+        except BaseException:
+            lock.close()
+            raise
+        self._lock = lock
+        lock.seek(0)
+        listed = lock.read().decode(errors="replace").splitlines()
+        names = [*(["config.yaml"] if config is not None else []), *files]
+        if not resume:
+            mine = names if self.kind is None else [*listed, *names]  # who only adds to a folder replaces its own
+            for name in dict.fromkeys(mine):
+                self._remove(name)
+            listed = [name for name in listed if name not in mine]
+        lock.truncate(0)
+        with named(self.path / MANIFEST):
+            lock.write("".join(f"{name}\n" for name in dict.fromkeys([*listed, *names])).encode())
+            lock.flush()
+        if config is not None:
+            write_whole(self.path / "config.yaml", config)
+
+    def release(self) -> None:
+        """Give the folder back."""
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+    def _kind_held(self) -> str | None:
+        """The kind of command whose config.yaml the folder holds; "" if no command wrote it, None if there is none."""
+        from torchfsid.config.documents import read_yaml
+
+        path = self.path / "config.yaml"
+        if not path.exists():
+            return None
+        try:
+            content = read_yaml(path)
+        except ConfigError:
+            return ""
+        of_observe = "task" in content or "tasks" in content
+        return str(content.get("kind", OBSERVE if of_observe else ""))
+
+    def _remove(self, name: str) -> None:
+        """A file of ours, and its subfolder if nothing else is in it."""
+        relative = PurePosixPath(name)
+        if not name or relative.is_absolute() or ".." in relative.parts:
+            return
+        path = self.path / relative
+        if path.is_file() or path.is_symlink():
+            path.unlink(missing_ok=True)
+        if path.parent != self.path:
+            with suppress(OSError):
+                path.parent.rmdir()
+
+
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Write a file whole or not at all."""
+    partial = path.with_name(path.name + ".partial")
+    try:
+        with named(path):
+            partial.write_bytes(content.encode() if isinstance(content, str) else content)
+            partial.replace(path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
+
+
+def write_json(path: Path, content: object) -> None:
+    """Write a JSON file whole or not at all; numbers that are not finite, which JSON does not know, become null."""
+    write_whole(path, json.dumps(_finite(content), indent=1, allow_nan=False) + "\n")
+
+
+@contextmanager
+def named(path: Path) -> Iterator[None]:
+    """An error of the operating system that does not say which file it is about gets the file's name."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None and not str(error.filename).endswith(".partial"):
+            raise
+        raise OSError(error.errno, error.strerror or str(error), os.fspath(path)) from error
+
+
+def _finite(content: Any) -> Any:
+    if isinstance(content, float):
+        return content if math.isfinite(content) else None
+    if isinstance(content, dict):
+        return {key: _finite(value) for key, value in content.items()}
+    return [_finite(value) for value in content] if isinstance(content, list | tuple) else content
+
+
+def _lock(file: BinaryIO, folder: Path) -> None:
+    if fcntl is None:
+        return
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise ConfigError(f"{folder}: another command is writing there") from error
+    except OSError:  # a file system without locks
+        return
+
+
+def _text(path: Path) -> str | None:
+    return path.read_text(encoding="utf-8") if path.exists() else None

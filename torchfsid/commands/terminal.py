@@ -1,0 +1,131 @@
+"""What commands show: tables on stdout, how far they have come on stderr.
+
+Nothing that is shown decides whether the work is done: a reader who leaves (`| head`) ends the printing and no more.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from typing import IO, Any, TypeVar, cast
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from torchfsid.commands.command_line import silence
+
+COMPILING = "Compiling kernels, once on this machine: about a minute"
+
+WIDTH = 160
+"""Columns of what is not a terminal: a file or a pipe has no width of its own."""
+
+Item = TypeVar("Item")
+
+
+class _Console(Console):
+    def on_broken_pipe(self) -> None:
+        self.quiet = True
+        silence(self.file.fileno())
+
+
+class _Aside:
+    """stderr, as long as it takes something: what cannot be shown there stops nothing."""
+
+    def __init__(self) -> None:
+        self._stream = sys.stderr
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError):
+            self._stream.flush()
+
+
+def console(least_width: int = 0) -> Console:
+    """stdout; tables that need more columns than a terminal has are wrapped by the terminal."""
+    made = _Console()
+    made.width = max(made.width if made.is_terminal else WIDTH, least_width)
+    return made
+
+
+def aside() -> Console:
+    """stderr."""
+    return Console(file=cast(IO[str], _Aside()))
+
+
+def table(title: str, texts: Sequence[str], numbers: Sequence[str] = ()) -> Table:
+    """Columns of texts, then of numbers, which wrap where a terminal is narrow: no digit is ever cut off."""
+    made = Table(title=title, title_justify="left")
+    for heading in texts:
+        made.add_column(heading, no_wrap=True)
+    for heading in numbers:
+        made.add_column(heading, justify="right", overflow="fold")
+    return made
+
+
+def track(items: Iterable[Item], what: str, total: int, finished: int = 0) -> Iterator[Item]:
+    """Pass items on, and show how far they have come.
+
+    Args:
+        what: is done with them.
+        total: how many there are, with those `finished` before.
+    """
+    shown = aside()
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    with Progress(*columns, TimeRemainingColumn(), console=shown, speed_estimate_period=600) as progress:
+        task = progress.add_task(_first(what, shown), total=total, completed=finished)
+        for item in items:
+            yield item
+            progress.update(task, advance=1, description=what)
+        if progress.tasks[0].completed > finished:
+            _kernels_are_compiled()
+
+
+@contextlib.contextmanager
+def status(what: str, computes: bool = False) -> Iterator[None]:
+    """Show that something is being done whose end is not known; does it use the compiled kernels?"""
+    shown = aside()
+    with shown.status(_first(what, shown) if computes else what):
+        yield
+    if computes:
+        _kernels_are_compiled()
+
+
+def digits(value: float, resolution: float) -> str:
+    """A number with at least four digits, and with as many as tell apart what is a tenth of `resolution` apart;
+    a dash for NaN, of which there is nothing to say."""
+    if math.isnan(value):
+        return "-"
+    enough, size = 4, abs(value)
+    if 0 < size < math.inf and math.isfinite(resolution):
+        resolution = max(resolution, 1e-12 * size)  # beyond that, digits are round-off
+        enough = max(4, 2 + math.floor(math.log10(size)) - math.floor(math.log10(resolution)))
+    return f"{value:.{enough}g}"
+
+
+def _first(what: str, shown: Console) -> str:
+    """What to show while the first item is worked on: kernels are compiled when they are first used."""
+    from torchfsid.kernels.compiled import folder
+
+    if (folder() / "complete").exists():
+        return what
+    if not shown.is_terminal:
+        shown.print(COMPILING)
+    return COMPILING
+
+
+def _kernels_are_compiled() -> None:
+    from torchfsid.kernels.compiled import folder
+
+    with contextlib.suppress(OSError):
+        folder().mkdir(parents=True, exist_ok=True)
+        (folder() / "complete").touch()

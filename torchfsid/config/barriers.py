@@ -1,0 +1,160 @@
+"""The barriers in configuration files, and the objects of `robots.barriers` that they stand for.
+
+Each answers for itself what a log must hold for it: the bodies' radii, their velocities now or one sample earlier.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from torchfsid.config.documents import Strict, wrong
+from torchfsid.config.quantities import (
+    BodyName,
+    Flag,
+    NonNegative,
+    PlanarVector,
+    Positive,
+    require_body,
+    require_box,
+)
+from torchfsid.errors import ConfigError
+
+if TYPE_CHECKING:
+    from torchfsid.robots.barriers import Barrier, ClassK
+
+
+class ClassKConfig(Strict):
+    """`ClassK`: gain sign(h) |h|^power."""
+
+    gain: Positive
+    power: Positive = 1.0
+
+    def build(self) -> ClassK:
+        from torchfsid.robots.barriers import ClassK
+
+        return ClassK(self.gain, self.power)
+
+
+class AvoidanceConfig(Strict):
+    """`CollisionAvoidance`, with `safety_distance` [m] or, when the radii are known, a `margin` [m] beyond them.
+
+    Attributes:
+        safety_distances: bodies that have a distance of their own [m].
+        neighbour_velocity: which velocities of other bodies the rows depend on.
+        soft: the controller may violate the rows.
+    """
+
+    kind: Literal["avoidance"] = "avoidance"
+    distance: Literal["squared", "euclidean"] = "squared"
+    safety_distance: Positive | None = None
+    safety_distances: dict[BodyName, Positive] = Field(default_factory=dict)
+    margin: NonNegative | None = None
+    class_k: ClassKConfig
+    neighbour_velocity: Literal["none", "current", "previous"] = "none"
+    soft: Flag = False
+
+    @model_validator(mode="after")
+    def _one_distance(self) -> AvoidanceConfig:
+        if (self.safety_distance is None) == (self.margin is None):
+            raise wrong(f"expected safety_distance or margin, got {'neither' if self.margin is None else 'both'}")
+        if self.safety_distances and self.margin is not None:
+            raise wrong(
+                "bodies have a distance of their own beside a safety_distance, not a margin", "safety_distances"
+            )
+        return self
+
+    @property
+    def uses_radius(self) -> bool:
+        return self.margin is not None
+
+    def require_radii(self, radius: Sequence[float] | None) -> None:
+        """Raises `ConfigError` if the rows need radii that the log does not have."""
+        if self.margin is not None and radius is None:
+            raise ConfigError("barriers: a margin needs the radii, but the log has none (column radius, bag.radius)")
+        if self.margin is not None and radius is not None and self.margin + min(radius) <= 0:
+            raise ConfigError("barriers: a margin of 0 needs positive radii")
+
+    def build(self, bodies: Sequence[str]) -> Barrier:
+        import torch
+
+        from torchfsid.robots.barriers import CollisionAvoidance
+
+        for name in self.safety_distances:
+            require_body(f"safety_distances.{name}", name, bodies)
+        Ds = self.safety_distance
+        if self.safety_distances:
+            Ds = torch.tensor([self.safety_distances.get(body, Ds) for body in bodies], dtype=torch.float64)
+        return CollisionAvoidance(
+            self.class_k.build(), Ds, self.margin, self.distance, self.neighbour_velocity, self.soft
+        )
+
+
+class _RobotsOwn(Strict):
+    """Rows that do not depend on other bodies."""
+
+    @property
+    def uses_radius(self) -> bool:
+        return False
+
+    def require_radii(self, radius: Sequence[float] | None) -> None:
+        pass
+
+    @property
+    def neighbour_velocity(self) -> Literal["none"]:
+        return "none"
+
+
+class SpeedBoxConfig(_RobotsOwn):
+    """`SpeedBox`: a limit per axis [m/s]."""
+
+    kind: Literal["speed_box"] = "speed_box"
+    limit: Annotated[tuple[Positive, ...], Field(min_length=2, max_length=2)]
+    soft: Flag = False
+
+    def build(self, bodies: Sequence[str]) -> Barrier:
+        from torchfsid.robots.barriers import SpeedBox
+
+        return SpeedBox(self.limit, self.soft)
+
+
+class SpeedPolygonConfig(_RobotsOwn):
+    """`SpeedPolygon`: a regular polygon of circumradius `limit` [m/s]."""
+
+    kind: Literal["speed_polygon"] = "speed_polygon"
+    sides: Annotated[int, Field(strict=True, ge=3, le=360)]
+    limit: Positive
+    soft: Flag = False
+
+    def build(self, bodies: Sequence[str]) -> Barrier:
+        from torchfsid.robots.barriers import SpeedPolygon
+
+        return SpeedPolygon(self.sides, self.limit, self.soft)
+
+
+class ArenaConfig(_RobotsOwn):
+    """`Arena`: walls around a box [m], kept at a distance `margin` [m]."""
+
+    kind: Literal["arena"] = "arena"
+    lower: PlanarVector
+    upper: PlanarVector
+    margin: NonNegative = 0.0
+    class_k: ClassKConfig
+    soft: Flag = False
+
+    @model_validator(mode="after")
+    def _is_a_box(self) -> ArenaConfig:
+        require_box(self.lower, self.upper)
+        return self
+
+    def build(self, bodies: Sequence[str]) -> Barrier:
+        from torchfsid.robots.barriers import Arena
+
+        return Arena(self.lower, self.upper, self.class_k.build(), self.margin, self.soft)
+
+
+BarrierConfig = Annotated[
+    AvoidanceConfig | SpeedBoxConfig | SpeedPolygonConfig | ArenaConfig, Field(discriminator="kind")
+]

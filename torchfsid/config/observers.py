@@ -1,0 +1,140 @@
+"""What the observers start from and how they run: prior, noise bounds, filter, as configuration files say it."""
+
+from __future__ import annotations
+
+import math
+import reprlib
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import field_validator, model_validator
+
+from torchfsid.config.documents import Strict, wrong
+from torchfsid.config.quantities import Flag, NonNegative, Positive, Vector, as_number, require_box
+from torchfsid.errors import ConfigError
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch import Tensor
+
+    from torchfsid.observers.ukf import ParameterUkf
+    from torchfsid.robots.barriers import Barrier
+    from torchfsid.robots.bounds import NoiseBound
+    from torchfsid.robots.tasks import Task
+    from torchfsid.sets.feasible_set import FeasibleSet
+
+
+FARTHEST = 1e100
+"""A prior that reaches further is unbounded in disguise: squares of its numbers would overflow."""
+
+
+class PriorConfig(Strict):
+    """The prior set of theta, a box in theta's units."""
+
+    lower: Vector
+    upper: Vector
+
+    @model_validator(mode="after")
+    def _is_a_box(self) -> PriorConfig:
+        require_box(self.lower, self.upper)
+        for name, corner in (("lower", self.lower), ("upper", self.upper)):
+            if max(map(abs, corner)) > FARTHEST:
+                raise wrong(f"expected a bounded set, no number beyond {FARTHEST:g}, got {list(corner)}", name)
+        return self
+
+    def build(self, robots: int) -> FeasibleSet:
+        """The prior set of each robot."""
+        from torchfsid.sets.feasible_set import FeasibleSet
+
+        return FeasibleSet.from_box(*self.corners(robots))
+
+    def corners(self, robots: int) -> tuple[Float[Tensor, "robots p"], Float[Tensor, "robots p"]]:
+        """Its lower and its upper corner, for each robot."""
+        import torch
+
+        lower, upper = torch.tensor([self.lower, self.upper], dtype=torch.float64)
+        return lower.expand(robots, -1), upper.expand(robots, -1)
+
+
+class _Errors(Strict):
+    slack: NonNegative | None = None
+    position: NonNegative = 0.0
+    neighbour_velocity: NonNegative = 0.0
+
+
+class NoiseConfig(_Errors):
+    """`NoiseBound`: bounds on errors of controls and slacks [m/s], positions [m], other bodies' velocities [m/s]."""
+
+    velocity: NonNegative
+
+    def build(self) -> NoiseBound:
+        from torchfsid.robots.bounds import NoiseBound
+
+        return NoiseBound(self.velocity, self.slack, self.position, self.neighbour_velocity)
+
+
+class ObservedNoiseConfig(_Errors):
+    """`NoiseConfig` for a log, which may itself say how large the errors in it must be: `velocity: auto`."""
+
+    velocity: float | Literal["auto"]
+
+    @field_validator("velocity", mode="plain")
+    @classmethod
+    def _is_bound_or_auto(cls, value: object) -> float | Literal["auto"]:
+        if value == "auto":
+            return "auto"
+        bound = as_number(value)
+        if not isinstance(bound, int | float) or isinstance(bound, bool) or not 0 <= bound <= sys.float_info.max:
+            raise wrong(f"expected a bound of at least 0 m/s or 'auto', got {reprlib.repr(value)}")
+        return float(bound)
+
+    def build(self) -> NoiseBound:
+        """Raises `ConfigError` for `auto`: someone has to find the bound first."""
+        if self.velocity == "auto":
+            raise ConfigError("noise.velocity: expected a number, got 'auto'")
+        return NoiseConfig(**self.model_dump()).build()
+
+
+class UkfConfig(Strict):
+    """The unscented Kalman filter on [x; theta], and how the hybrid observer joins it with the set.
+
+    Attributes:
+        position_noise: standard deviation of a measured position [m]; R is its square.
+        process_noise: standard deviation of theta's drift in one second [units of theta].
+        prior_std: standard deviation of theta at the start; None: that of the prior box.
+        qp_inside: the QP is solved inside the filter's dynamics; otherwise the measurement says which rows are active.
+        feedback: the hybrid's projected estimate replaces the filter's own.
+    """
+
+    position_noise: Positive = 1e-3
+    process_noise: NonNegative = 1e-4
+    prior_std: Positive | None = None
+    qp_inside: Flag = False
+    feedback: Flag = False
+
+    def spread(self, prior: PriorConfig) -> tuple[float, ...]:
+        """Standard deviations of theta at the start: those of a uniform distribution over the prior, unless given."""
+        if self.prior_std is not None:
+            return (self.prior_std,) * len(prior.lower)
+        return tuple((high - low) / math.sqrt(12) for low, high in zip(prior.lower, prior.upper, strict=True))
+
+    def build(
+        self, task: Task, barriers: Sequence[Barrier], prior: PriorConfig, robots: int, active_tolerance: float
+    ) -> ParameterUkf:
+        """The filter of so many robots, which starts from the centre of the prior."""
+        import torch
+
+        from torchfsid.observers.ukf import ParameterUkf
+
+        lower, upper = prior.corners(robots)
+        return ParameterUkf(
+            task,
+            barriers,
+            mean=(lower + upper) / 2,
+            spread=torch.tensor(self.spread(prior), dtype=torch.float64).expand(robots, -1),
+            position_noise=self.position_noise,
+            process_noise=self.process_noise,
+            active_tolerance=active_tolerance,
+            qp_inside=self.qp_inside,
+        )

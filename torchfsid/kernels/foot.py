@@ -1,0 +1,53 @@
+r"""The nearest point of a polygon in the norm sqrt(z' H z), and its active rows: one polygon at a time."""
+
+from __future__ import annotations
+
+from typing import no_type_check
+
+import numpy as np
+
+from torchfsid.kernels.compiled import item, launcher
+from torchfsid.kernels.polygon import after_in, before_in
+
+
+@item
+@no_type_check
+def foot_on(vertices, A, b, n, x, y, metric):
+    """(x, y, two active rows): the nearest of the feet on all edges. Rows that are not there are -1."""
+    inside = True
+    for i in range(n):
+        inside = inside and A[i, 0] * x + A[i, 1] * y <= b[i]
+    if inside:
+        return x, y, -1, -1
+    least, foot_x, foot_y, first, second = np.inf, x, y, -1, -1
+    for i in range(n):
+        j = after_in(i, n)
+        along_x, along_y = vertices[j, 0] - vertices[i, 0], vertices[j, 1] - vertices[i, 1]
+        away_x, away_y = vertices[i, 0] - x, vertices[i, 1] - y
+        p = metric[0, 0] * along_x + metric[0, 1] * along_y
+        q = metric[1, 0] * along_x + metric[1, 1] * along_y
+        squared = p * along_x + q * along_y
+        share = min(max(-(p * away_x + q * away_y) / squared, 0.0), 1.0) if squared > 0 else 0.0
+        away_x += share * along_x
+        away_y += share * along_y
+        distance = metric[0, 0] * away_x * away_x + 2 * metric[0, 1] * away_x * away_y + metric[1, 1] * away_y * away_y
+        if distance < least:
+            least, foot_x, foot_y = distance, vertices[i, 0] + share * along_x, vertices[i, 1] + share * along_y
+            first = before_in(i, n) if share <= 0 else i
+            second = -1 if 0 < share < 1 else i if share <= 0 else j
+    return foot_x, foot_y, first, second
+
+
+@launcher
+@no_type_check
+def feet(vertices, A, b, count, point, metric):
+    """Of each polygon the one nearest to `point` (B, 2) in the norm of `metric` (B, 2, 2), and its active rows (B, 2).
+
+    No row: the point itself; one: the foot on an edge; two: a vertex. Rows that are not there are -1.
+    """
+    foot, active = np.empty((len(count), 2)), np.empty((len(count), 2), np.int64)
+    for k in range(len(count)):
+        foot[k, 0], foot[k, 1], active[k, 0], active[k, 1] = foot_on(
+            vertices[k], A[k], b[k], count[k], point[k, 0], point[k, 1], metric[k]
+        )
+    return foot, active

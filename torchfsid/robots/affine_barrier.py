@@ -1,0 +1,74 @@
+"""Rows of one's own: the barrier that is given as a matrix and a vector, and says of itself what it is told to."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchfsid.errors import InputError
+from torchfsid.halfspaces import Halfspaces
+from torchfsid.robots.barriers import NeighbourVelocity
+from torchfsid.robots.bounds import ErrorBounds, RowErrors
+from torchfsid.robots.measurement import Measurement
+
+
+@dataclass(frozen=True)
+class AffineBarrier:
+    """Any rows A u <= b: A (m, n) and b (m,), given as tensors or as functions of the measurement.
+
+    Rows given as tensors depend on nothing. Of functions nothing is known but what the other arguments say, and samples
+    for which that matters are skipped.
+
+    Attributes:
+        names: of the rows.
+        soft: the controller may violate the rows.
+        row_errors: how far the rows may be off where positions have errors; functions need it there.
+        depends_on_bodies: False: the functions look at the robot alone, so that no body without a slot has a row and no
+            neighbour's velocity counts.
+        neighbour_velocity: see `Barrier`; None: unknown.
+        left_out: see `Barrier.slack_left_out`; None: unknown.
+    """
+
+    A: Tensor | Callable[[Measurement], Tensor]
+    b: Tensor | Callable[[Measurement], Tensor]
+    names: tuple[str, ...]
+    soft: bool = False
+    row_errors: Callable[[Measurement, ErrorBounds], RowErrors] | None = None
+    depends_on_bodies: bool = True
+    neighbour_velocity: NeighbourVelocity | None = None
+    left_out: Callable[[Measurement], Float[Tensor, "*batch"]] | None = None
+
+    def __post_init__(self) -> None:
+        if not (callable(self.A) or callable(self.b)):
+            object.__setattr__(self, "depends_on_bodies", False)
+        if not self.depends_on_bodies:
+            object.__setattr__(self, "neighbour_velocity", "none")
+
+    def __call__(self, measurement: Measurement) -> Halfspaces:
+        A = self.A(measurement) if callable(self.A) else self.A
+        b = self.b(measurement) if callable(self.b) else self.b
+        m, (*batch, n) = len(self.names), measurement.x.shape
+        if A.shape[-2:] != (m, n) or b.shape[-1:] != (m,):
+            expected = f"A (*batch, {m}, {n}) and b (*batch, {m})"
+            raise InputError("AffineBarrier(A, b)", expected, (tuple(A.shape), tuple(b.shape)))
+        return Halfspaces(A.to(torch.float64).expand(*batch, m, n), b.to(torch.float64).expand(*batch, m))
+
+    def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
+        if self.row_errors is not None:
+            return self.row_errors(measurement, bounds)
+        if (callable(self.A) or callable(self.b)) and any(bool((bound > 0).any()) for bound in bounds):
+            raise InputError("AffineBarrier.row_errors", "how far the rows may be off where bodies may be", None)
+        return RowErrors.none(self(measurement).b)
+
+    def slack_left_out(self, measurement: Measurement) -> Float[Tensor, "*batch"]:
+        if self.left_out is not None:
+            return self.left_out(measurement)
+        return torch.full_like(measurement.x[..., 0], -math.inf if self.depends_on_bodies else math.inf)
+
+    def labels(self, bodies: Sequence[str]) -> list[str]:
+        return list(self.names)

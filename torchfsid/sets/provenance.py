@@ -1,0 +1,83 @@
+"""Where the gradients of a set's facets come from: the rows that were given, as long as a facet of the set is one.
+
+A search works on numbers. The rows that it has made facets, with their gradients, are kept beside it in sheets, one for
+each intersection; every facet has a label, the place of its row among all sheets, or 0 if it has no gradient. A sheet
+that no facet refers to is dropped, and with it the graph of that intersection: memory is facets.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchfsid.halfspaces import array
+
+
+@dataclass(frozen=True)
+class Sheets:
+    """Rows A (N, p) and b (N,) with gradients, sheet by sheet; the first row of the first sheet has the label 1.
+
+    Attributes:
+        sheets: A and b of each.
+        rows: how many rows there are in all of them.
+    """
+
+    sheets: tuple[tuple[Tensor, Tensor], ...] = ()
+    rows: int = 0
+
+    def with_sheet(self, A: Float[Tensor, "N p"], b: Float[Tensor, "N"]) -> Sheets:
+        """One sheet more, its rows labelled on from the last one."""
+        return Sheets((*self.sheets, (A, b)), self.rows + len(b)) if len(b) > 0 else self
+
+    def in_use(self, label: Int[Tensor, "B F"]) -> tuple[Sheets, Int[Tensor, "B F"]]:
+        """Without the rows that are no facets, and the labels that the facets have then.
+
+        They are looked for only where there are more than twice as many rows as places for facets, and a sheet is
+        shortened only where half of it is not used: so it costs little, and a row goes through few tensors.
+        """
+        if self.rows <= 2 * label.numel():
+            return self, label
+        table = array(label)
+        used, numbers = np.zeros(self.rows + 1, dtype=np.bool_), np.zeros(self.rows + 1, dtype=np.int64)
+        used[table] = True
+        sheets, old, new = [], 1, 1
+        for A, b in self.sheets:
+            kept = used[old : old + len(b)].nonzero()[0]
+            if 2 * len(kept) >= len(b):
+                kept = np.arange(len(b))
+                sheets.append((A, b))
+            elif len(kept) > 0:
+                rows = torch.from_numpy(kept).to(b.device)
+                sheets.append((A.index_select(0, rows), b.index_select(0, rows)))
+            numbers[old + kept] = np.arange(new, new + len(kept))
+            old, new = old + len(b), new + len(kept)
+        return Sheets(tuple(sheets), new - 1), torch.from_numpy(numbers[table]).to(label.device)
+
+    def joined(self, other: Sheets, label: Int[Tensor, "B F"]) -> tuple[Sheets, Int[Tensor, "B F"]]:
+        """These sheets and those of `other`, and what its labels are then. A sheet of both is kept once."""
+        new = [sheet for sheet in other.sheets if not any(sheet is mine for mine in self.sheets)]
+        sheets, first, next_label = (*self.sheets, *new), {}, 1
+        for sheet in sheets:
+            first[id(sheet)] = next_label
+            next_label += len(sheet[1])
+        numbers = [
+            torch.arange(first[id(sheet)], first[id(sheet)] + len(sheet[1]), device=label.device)
+            for sheet in other.sheets
+        ]
+        return Sheets(sheets, next_label - 1), torch.cat([label.new_zeros(1), *numbers])[label]
+
+    def attached(
+        self, A: Float[Tensor, "B F p"], b: Float[Tensor, "B F"], label: Int[Tensor, "B F"]
+    ) -> tuple[Float[Tensor, "B F p"], Float[Tensor, "B F"]]:
+        """The facets' rows, numbers without gradients, with the gradients of the rows that they are labelled by."""
+        if not self.sheets:
+            return A, b
+        of_A = torch.cat([A.new_zeros(1, A.shape[-1]), *(rows for rows, _ in self.sheets)])
+        of_b = torch.cat([b.new_zeros(1), *(right for _, right in self.sheets)])
+        of_A, of_b = (part.index_select(0, label.flatten()).unflatten(0, label.shape) for part in (of_A, of_b))
+        # Zeros with gradients are added: a facet that was moved outward keeps its place.
+        return A + (of_A - of_A.detach()), b + (of_b - of_b.detach())
