@@ -21,7 +21,6 @@ from torch import Tensor
 
 from benchmarks import save
 from benchmarks.scenario import NEIGHBOURS, Fleet, measured, observer
-from torchfsid.kernels.compiled import installed
 
 SIZES, LEAST, BLOCK = (1_000, 10_000, 100_000), 10_000, 10
 CROWDS = (4, 8, 16, 32)
@@ -110,7 +109,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--largest", type=int, default=SIZES[-1])
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    ways = {"torch": False} | ({"compiled": True} if installed() else {})
+    ways = {"torch": False, "compiled": True}
     results: dict = {"neighbours": NEIGHBOURS}
     for way, compiled in ways.items():
         run(1000, 2, True, compiled)  # compile, and load what loads late
@@ -135,4 +134,4 @@ def main(arguments: list[str]) -> None:
         print(f"  {long['steps']} steps of {long['robots']} robots: {along} us; slots {slots[0]}..{slots[-1]}")
     results["peak_memory_MiB"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(f"\npeak memory {results['peak_memory_MiB']:.0f} MiB")
-    print(f"saved: {save('fleet', results, ['torch', 'numpy', 'scipy', *(['numba'] if installed() else [])])}")
+    print(f"saved: {save('fleet', results, ['torch', 'numpy', 'scipy', 'numba'])}")

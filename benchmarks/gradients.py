@@ -8,6 +8,10 @@ torchfsid (compiled clips, then implicit derivatives) against the same clips wit
 (tests/reference_clip.py). Times are CPU times of one thread for value and gradient, the fastest of some
 repetitions. Errors are those of the derivative along a random direction, relative to the gradient's norm, against
 central differences.
+
+probe: one gradient step of the probe design (configs/probe_placement.yaml, paths of 3 way-points): mean log-area of
+Theta(T) over placements and goals through closed loop, evidence and clips, and its gradient with respect to the
+placements. `Probing.left` against the same with every sample read and clipped in torch as it comes.
 """
 
 from __future__ import annotations
@@ -15,6 +19,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,8 +27,12 @@ import torch
 from torch import Tensor
 
 from benchmarks import save
+from experiments.design.probe import Probing
+from experiments.design.search import Search
+from experiments.kinds import load
 from tests.reference_clip import Rings
 from torchfsid.halfspaces import Halfspaces
+from torchfsid.identification.evidence import evidence
 from torchfsid.sets.feasible_set import FeasibleSet
 
 BATCHES = (1, 64, 1024)
@@ -68,34 +77,71 @@ def gradient(mean: Callable[[Rows], Tensor], rows: Rows) -> Rows:
     return list(torch.autograd.grad(mean(leaves), leaves, allow_unused=True, materialize_grads=True))
 
 
-def clips(repeats: int) -> list[dict[str, Any]]:
-    found = []
-    for batch in BATCHES:
-        rows = workload(batch)
-        generator = torch.Generator().manual_seed(1)
-        along = [torch.randn(part.shape, dtype=part.dtype, generator=generator) for part in rows]
+def measured(
+    mean: Callable[[Rows], Tensor], rows: Rows, along: Rows, difference: float, repeats: int
+) -> dict[str, float]:
+    """CPU seconds of a gradient, and its error along a direction."""
+    spent = []
+    for _ in range(repeats + 1):  # the first one compiles
+        began = time.process_time()
+        slopes = gradient(mean, rows)
+        spent.append(time.process_time() - began)
+    slope = sum(float((part * way).sum()) for part, way in zip(slopes, along, strict=True))
+    norm = sum(float(part.square().sum()) for part in slopes) ** 0.5
+    return {"seconds": min(spent[1:]), "error": abs(slope - difference) / norm}
+
+
+def compared(
+    what: str, batch: int, ways: dict[str, Callable[[Rows], Tensor]], rows: Rows, repeats: int
+) -> dict[str, Any]:
+    generator = torch.Generator().manual_seed(1)
+    along = [torch.randn(part.shape, dtype=part.dtype, generator=generator) for part in rows]
+    with torch.no_grad():
         ahead, behind = (
-            by_implicit_derivatives([part + sign * STEP * way for part, way in zip(rows, along, strict=True)])
+            ways["implicit"]([part + sign * STEP * way for part, way in zip(rows, along, strict=True)])
             for sign in (1, -1)
         )
-        difference = float(ahead - behind) / (2 * STEP)
-        row: dict[str, Any] = {"batch": batch}
-        for name, mean in (("implicit", by_implicit_derivatives), ("torch", by_torch_clips)):
-            spent = []
-            for _ in range(repeats + 1):  # the first one compiles
-                began = time.process_time()
-                slopes = gradient(mean, rows)
-                spent.append(time.process_time() - began)
-            slope = sum(float((part * way).sum()) for part, way in zip(slopes, along, strict=True))
-            norm = sum(float(part.square().sum()) for part in slopes) ** 0.5
-            row[name] = {"seconds": min(spent[1:]), "error": abs(slope - difference) / norm}
-        row["ratio"] = row["torch"]["seconds"] / row["implicit"]["seconds"]
-        found.append(row)
-        print(
-            f"clips, B = {batch:5d}: {1e3 * row['implicit']['seconds']:8.1f} ms, in torch "
-            f"{1e3 * row['torch']['seconds']:8.1f} ms, ratio {row['ratio']:5.1f}; errors "
-            f"{row['implicit']['error']:.0e}, {row['torch']['error']:.0e}"
-        )
+    difference = float(ahead - behind) / (2 * STEP)
+    row: dict[str, Any] = {"batch": batch}
+    row |= {name: measured(mean, rows, along, difference, repeats) for name, mean in ways.items()}
+    row["ratio"] = row["torch"]["seconds"] / row["implicit"]["seconds"]
+    print(
+        f"{what}, B = {batch:5d}: {1e3 * row['implicit']['seconds']:8.1f} ms, in torch "
+        f"{1e3 * row['torch']['seconds']:8.1f} ms, ratio {row['ratio']:5.1f}; errors "
+        f"{row['implicit']['error']:.0e}, {row['torch']['error']:.0e}"
+    )
+    return row
+
+
+def clips(repeats: int) -> list[dict[str, Any]]:
+    ways = {"implicit": by_implicit_derivatives, "torch": by_torch_clips}
+    return [compared("clips", batch, ways, workload(batch), repeats) for batch in BATCHES]
+
+
+def probe(repeats: int) -> list[dict[str, Any]]:
+    config = load(Path("configs/probe_placement.yaml"), [], "design")
+    probing, found = Probing.of(config), []
+    goals = probing.draw_goals(config.goals.train, 1)
+    drawn = Search.of(probing, goals, 3, np.random.SeedSequence(0)).near_path(128)
+    with torch.no_grad():
+        left = probing.left(drawn, goals)
+        drawn = drawn[left.sound.all(-1) & (left.area < probing.prior_area / 2).any(-1)]
+
+    def by_the_design(rows: Rows) -> Tensor:
+        return probing.left(rows[0], goals).area.log().mean()
+
+    def sample_by_sample(rows: Rows) -> Tensor:
+        lower, upper = (corner.expand(len(rows[0]) * len(goals), 2) for corner in probing.prior)
+        rings, prior = Rings.boxes(lower, upper), probing.prior_of(len(lower))
+        for sample in probing.loop(rows[0], goals):
+            omega = evidence(probing.model, prior, sample.measurement, compiled=False).omega
+            rings = rings.clip(omega.A, omega.b)
+        return rings.area().log().mean()
+
+    for placements in (1, 4, 32):
+        ways = {"implicit": by_the_design, "torch": sample_by_sample}
+        rows = [drawn[:placements].contiguous()]
+        found.append(compared("probe", placements * len(goals), ways, rows, repeats))
     return found
 
 
@@ -104,5 +150,5 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--repeats", type=int, default=5)
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    results = {"clips": clips(options.repeats)}
+    results = {"clips": clips(options.repeats), "probe": probe(options.repeats)}
     print(f"saved: {save('gradients', results, ['torch', 'numpy', 'numba'])}")

@@ -18,7 +18,6 @@ import torch
 
 from benchmarks import save
 from benchmarks.scenario import BARRIER, EPISODE, ERROR, TASK, Fleet, measured, observer
-from torchfsid.kernels.compiled import installed
 from torchfsid.observers.hybrid import HybridObserver
 from torchfsid.observers.protocol import Observer
 from torchfsid.observers.ukf import ParameterUkf
@@ -41,10 +40,12 @@ def makers(fleet: Fleet, robots: range) -> dict[str, Callable[[], Observer]]:
             active_tolerance=ERROR,
         )
 
-    ways: dict[str, Callable[[], Observer]] = {"set, torch": lambda: observer(prior, False)}
-    if installed():
-        ways |= {"set, compiled": lambda: observer(prior, True)}
-    return ways | {"UKF (filterpy)": ukf, "hybrid": lambda: HybridObserver(observer(prior, installed()), ukf())}
+    return {
+        "set, torch": lambda: observer(prior, False),
+        "set, compiled": lambda: observer(prior, True),
+        "UKF (filterpy)": ukf,
+        "hybrid": lambda: HybridObserver(observer(prior, True), ukf()),
+    }
 
 
 def run(robots: int, fleets: int) -> dict[str, dict]:
@@ -90,5 +91,4 @@ def main(arguments: list[str]) -> None:
                 f"  {name:16s} {what['microseconds']:9.1f} us  {ratio:7.2f} x as fast as the UKF   "
                 f"errors at the end: median {what['median_error']:.4f} m, mean {what['mean_error']:.4f} m"
             )
-    packages = ["torch", "numpy", "filterpy", *(["numba"] if installed() else [])]
-    print(f"saved: {save('observer', results, packages)}")
+    print(f"saved: {save('observer', results, ['torch', 'numpy', 'filterpy', 'numba'])}")

@@ -146,4 +146,4 @@ def finite(*tensors: Tensor) -> bool:
 
 def array(tensor: Tensor) -> np.ndarray:
     """The tensor as the kernels take it: on the CPU, contiguous, without a copy if it is."""
-    return tensor.detach().cpu().contiguous().numpy()
+    return np.ascontiguousarray(tensor.numpy(force=True))

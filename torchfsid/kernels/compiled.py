@@ -20,10 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import numba
-import torch
 from numba import njit
 from numba.extending import register_jitable
-from torch import Tensor
 
 _OPTIONS: dict[str, Any] = {"error_model": "numpy"}  # a division by zero is infinite or NaN, as in numpy
 
@@ -70,30 +68,3 @@ def _is_writable(path: Path) -> bool:
             return True
     except OSError:
         return False
-
-
-# Below here: to be removed when the last module stops asking.
-
-
-def installed() -> bool:
-    return True
-
-
-def use_kernel(compiled: bool | None, *tensors: Tensor) -> bool:
-    """Shall a function of these tensors run compiled? `compiled` is the caller's wish; None: wherever it can.
-
-    Raises:
-        InputError: it must, but a tensor needs a gradient or is not on the CPU.
-    """
-    from torchfsid.errors import InputError
-
-    if compiled is False:
-        return False
-    obstacle = None
-    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
-        obstacle = "gradients are required"
-    elif not all(tensor.is_cpu for tensor in tensors):
-        obstacle = "tensors are not on the CPU"
-    if compiled and obstacle is not None:
-        raise InputError("compiled", "False or None", f"True, but {obstacle}")
-    return obstacle is None
