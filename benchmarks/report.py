@@ -140,22 +140,27 @@ def layers(found: dict[str, Any]) -> str:
 
 
 def gradients(found: dict[str, Any]) -> str:
-    body = [
-        [
-            row["batch"], number(1e3 * row["implicit"]["seconds"]), number(1e3 * row["torch"]["seconds"]),
-            number(row["ratio"]), f"{row['implicit']['error']:.0e}", f"{row['torch']['error']:.0e}",
-        ]
-        for row in found["clips"]
-    ]  # fmt: skip
-    return "\n".join(
-        [
-            "## gradients: through the clips of a set\n",
-            "The mean of log(area) after 20 clips of 16 rows and its gradient with respect to all rows; CPU time of",
-            "one thread. `torch`: the same clips with every step differentiated (the tests' reference). Errors of the",
-            "derivative along a random direction, relative to the gradient's norm, against central differences.\n",
-            table(["B", "ms", "torch, ms", "ratio", "error", "torch, error"], body),
-        ]
-    )
+    parts = [
+        "## gradients: through the clips of a set\n",
+        "CPU time of one thread for a value and its gradient; errors of the derivative along a random direction,",
+        "relative to the gradient's norm, against central differences. `torch`: every step differentiated, the clips",
+        "too (the tests' reference).\n",
+    ]
+    heads = {
+        "clips": "mean log-area of B sets after 20 clips of 16 rows, with respect to all rows",
+        "probe": "one step of the probe design: closed loop, evidence and clips of 20 samples; B goals in all",
+    }
+    for what, head in heads.items():
+        body = [
+            [
+                row["batch"], number(1e3 * row["implicit"]["seconds"]), number(1e3 * row["torch"]["seconds"]),
+                number(row["ratio"]), f"{row['implicit']['error']:.0e}", f"{row['torch']['error']:.0e}",
+            ]
+            for row in found[what]
+        ]  # fmt: skip
+        columns = ["B", "ms", "torch, ms", "ratio", "error", "torch, error"]
+        parts += [f"**{what}**: {head}\n", table(columns, body)]
+    return "\n".join(parts)
 
 
 def page() -> str:
