@@ -2,9 +2,9 @@ r"""Half-spaces: the one type for safe controls and for sets of parameters.
 
     {z in R^n : A z <= b},    A (*batch, m, n),  b (*batch, m),    closed, row by row.
 
-A row 0.z <= 1 holds everywhere. Such rows are padding: they let scenes with different numbers of rows share a batch, and
-a mask drops rows by turning them into padding. Rows may carry a `source`, an integer that names the constraint each row
-came from. All operations keep it.
+A row 0.z <= 1 holds everywhere. Such rows are padding: they let scenes with different numbers of rows share a batch,
+and a mask drops rows by turning them into padding. Rows may carry a `source`, an integer that names the constraint each
+row came from. All operations keep it.
 """
 
 from __future__ import annotations

@@ -9,8 +9,8 @@ exactly, and the row that it violates most enters, until none is violated.
 The nearest point is found by the method of Goldfarb and Idnani (Math. Programming 27, 1983). The active rows are made
 orthogonal one by one, a_s = Q_s + sum_i<s T_si Q_i. An entering row n is n = sum_s c_s a_s + d, d orthogonal to all of
 them. A step of length t changes the multipliers by -t c and the row's violation by -t |d|^2. The row whose multiplier
-reaches zero first leaves. If d = 0 and no row can leave, then n - sum_s c_s a_s = 0 combines rows with weights >= 0 whose
-bounds contradict each other: the set is empty.
+reaches zero first leaves. If d = 0 and no row can leave, then n - sum_s c_s a_s = 0 combines rows with weights >= 0
+whose bounds contradict each other: the set is empty.
 
 The inscribed ball is found by the dual simplex method with lexicographic ratios. These prevent cycles and make the
 answer unique: of all centres, the one with the smallest z_1, among these the one with the smallest z_2, and so on. The
@@ -261,8 +261,8 @@ def inscribed_rows(A, b, simplex, epsilon, basis, M, V, work, able):
 def leaving(V, share, able, tie):
     """The place in the basis that leaves, among those that are `able` to; -1 if none is.
 
-    It is the first whose multiplier reaches zero. Ties are broken by z_1, then by z_2, and so on, and last by the largest
-    pivot.
+    It is the first whose multiplier reaches zero. Ties are broken by z_1, then by z_2, and so on, and last by the
+    largest pivot.
     """
     n = len(share)
     for key in range(-1, n - 1):

@@ -1,4 +1,4 @@
-r"""The frame in which a programme over {z : A z <= b} is solved: the point y is its origin, I its metric, rows are unit.
+r"""The frame in which a programme over {z : A z <= b} is solved: origin at the point y, metric I, unit rows.
 
     x = L'(z - y),   H = L L',   rows w_j = L^-1 a_j / |L^-1 a_j|
 

@@ -296,7 +296,7 @@ def clip(polygons, A, b, stamp, source, first_label, most):
                 lost_source[k, i] = ring_source[k, e] if e < V else source[k, e - V]
         if shrunk[k] and n > most:
             n = merge_ring(ring, edge, n, most, lines, spare, spare_edge)
-            # The order of summation affects the areas.
+            # Each area carries the round-off of its sum.
             shrunk[k] = area_of(ring, n) <= area_of(vertices[k], count[k]) * (1 - ROUND_OFF)
         if not shrunk[k]:
             continue

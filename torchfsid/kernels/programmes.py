@@ -6,8 +6,8 @@ r"""Two convex programmes over half-spaces {z : A z <= b}, item by item.
 N are the active rows. They are searched for (`active_rows`) in the frame of the point and the metric (`frame`). The
 solution of the active rows is corrected once with the given rows, which removes the round-off of the frame. Then it is
 verified: a_j.z <= b_j for all rows, equality for the active ones, mu >= 0, and stationarity. Each condition must hold
-up to `VERIFIED` times the size of its terms. Otherwise the status is UNSOLVED, and `programmes.exact` solves the item in
-rational arithmetic (`programmes.rational`).
+up to `VERIFIED` times the size of its terms. Otherwise the status is UNSOLVED, and `programmes.exact` solves the item
+in rational arithmetic (`programmes.rational`).
 """
 
 from __future__ import annotations
