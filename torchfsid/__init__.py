@@ -1,4 +1,4 @@
-"""torchfsid: for each robot of a team, and at every moment, the set in which its hidden task parameter must lie.
+"""torchfsid computes, for each robot of a team and at every time, the set in which its hidden task parameter must lie.
 
 After J. Grover, C. Liu, K. Sycara, "Feasible Region-based Identification Using Duality" (called G. throughout).
 The names below are the public interface; they load on first use, so that `torchfsid --help` does not wait for PyTorch.

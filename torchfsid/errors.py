@@ -1,16 +1,16 @@
-"""What can go wrong, and whose fault it is.
+"""The exceptions that torchfsid raises on purpose.
 
-The caller's mistakes raise here, at the boundary, with what was expected and what came. The failures of data
-(an empty set, an infeasible QP, a missing robot) are values: statuses and masks, so one bad item never kills a batch.
+A mistake of the caller raises an exception that says what was expected and what was given. A failure of the data (an
+empty set, an infeasible QP, a missing robot) is a value, a status or a mask. So one bad item never stops a batch.
 """
 
 
 class FsidError(Exception):
-    """Root of everything torchfsid raises on purpose."""
+    """Base class of all exceptions that torchfsid raises on purpose."""
 
 
 class InputError(FsidError, ValueError):
-    """An argument is not what the function takes: its name, what was expected, what came."""
+    """An argument does not fit the function. The message names it, says what was expected and what was given."""
 
     def __init__(self, argument: str, expected: str, actual: object):
         super().__init__(f"{argument}: expected {expected}, got {actual}")
@@ -18,15 +18,15 @@ class InputError(FsidError, ValueError):
 
 
 class ConfigError(FsidError):
-    """A configuration is wrong: the path of the key, what was expected, what came."""
+    """A configuration is wrong. The message names the key's path, what was expected and what was given."""
 
 
 class LogError(FsidError):
-    """A log cannot be read as one: the file, the line, what is wrong there."""
+    """A log cannot be read. The message names the file, the line and what is wrong there."""
 
 
 class InconsistentError(FsidError):
-    """No parameter explains the measurements, and the observer was told to raise then."""
+    """No parameter explains the measurements, and the observer was told to raise an exception in this case."""
 
 
 class SolverError(FsidError):
@@ -34,10 +34,10 @@ class SolverError(FsidError):
 
 
 class FigureError(FsidError):
-    """A figure could not be drawn: the file that is missing or damaged, or what the plotting library said."""
+    """A figure could not be drawn. The message names the missing or damaged file, or quotes the plotting library."""
 
 
 def one_line(message: object) -> str:
-    """What somebody else says, on one printable line; an exception without words is named."""
+    """A foreign message on one printable line. An exception without a message gives the name of its class."""
     text = " ".join(str(message).split()) or type(message).__name__
     return "".join(character if character.isprintable() else "?" for character in text)

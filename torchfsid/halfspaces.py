@@ -2,8 +2,9 @@ r"""Half-spaces: the one type for safe controls and for sets of parameters.
 
     {z in R^n : A z <= b},    A (*batch, m, n),  b (*batch, m),    closed, row by row.
 
-A row 0.z <= 1 holds everywhere: it is the padding that lets ragged scenes share a batch, and the way a mask drops rows.
-Rows may carry a `source`, an integer that says which constraint each came from; it travels with them.
+A row 0.z <= 1 holds everywhere. Such rows are padding: they let scenes with different numbers of rows share a batch,
+and a mask drops rows by turning them into padding. Rows may carry a `source`, an integer that names the constraint each
+row came from. All operations keep it.
 """
 
 from __future__ import annotations
@@ -23,9 +24,15 @@ from torchfsid.tolerances import ROUND_OFF
 
 @dataclass(frozen=True)
 class Halfspaces:
-    """{z : A z <= b}. Tensors of any float type are cast to float64; gradients flow back through the cast.
+    """{z : A z <= b}. Tensors of any float type are cast to float64. Gradients flow back through the cast.
 
-    Raises `InputError` if the last dimensions of `A` (*batch, m, n) and `b` (*batch, m) do not match.
+    Attributes:
+        A: the rows (*batch, m, n).
+        b: the right-hand sides (*batch, m).
+        source: the constraint that each row came from (*batch, m), or None.
+
+    Raises:
+        InputError: the last dimensions of `A` and `b` do not match.
     """
 
     A: Float[Tensor, "*#batch m n"]
@@ -49,7 +56,7 @@ class Halfspaces:
 
     @classmethod
     def stack(cls, parts: Sequence[Halfspaces]) -> Halfspaces:
-        """The intersection of several, their rows one below the other; batches broadcast."""
+        """The intersection of several sets: their rows, one below the other. Batches broadcast."""
         if len(parts) == 1:
             return parts[0]
         batch = np.broadcast_shapes(*(part.batch_shape for part in parts))
@@ -73,22 +80,22 @@ class Halfspaces:
         return self.A.shape[-1]
 
     def pullback(self, G: Float[Tensor, "*batch n p"], f: Float[Tensor, "*batch n"]) -> Halfspaces:
-        """{theta in R^p : G theta + f in this set}, i.e. A G theta <= b - A f."""
+        """The preimage {theta in R^p : G theta + f in this set}, that is A G theta <= b - A f."""
         G, f = G.to(torch.float64), f.to(torch.float64)
         return Halfspaces(self.A @ G, self.b - (self.A @ f.unsqueeze(-1)).squeeze(-1), self.source)
 
     def where(self, keep: Bool[Tensor, "*batch m"]) -> Halfspaces:
-        """The rows marked `keep`; the others become padding 0.z <= 1."""
+        """Keep the rows marked by `keep`. The others become padding 0.z <= 1."""
         if bool(keep.all()):
             return self
         return Halfspaces(torch.where(keep.unsqueeze(-1), self.A, 0.0), torch.where(keep, self.b, 1.0), self.source)
 
     def norms(self) -> Float[Tensor, "*batch m"]:
-        """|a_j|, with 1 for padding rows, so that dividing by it is always safe (and so is its gradient)."""
+        """The lengths |a_j|. Padding rows give 1, so that a division by the lengths and its gradient are finite."""
         return lengths(self.A)
 
     def normalised(self) -> Halfspaces:
-        """The same set with unit rows (padding rows are left as they are)."""
+        """The same set with unit rows. Padding rows are left unchanged."""
         A, b, norms = self._scaled()
         return Halfspaces(A / norms.unsqueeze(-1), b / norms, self.source)
 
@@ -98,36 +105,36 @@ class Halfspaces:
         return (b - dot(A, z.to(torch.float64).unsqueeze(-2))) / norms
 
     def round_off(self, z: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch m"]:
-        """What floating point leaves open about `slack(z)`, in the units of z."""
+        """A bound on the rounding error of `slack(z)`, in the units of z."""
         A, b, norms = self._scaled()
         sizes = dot(A.abs(), z.abs().to(torch.float64).unsqueeze(-2)) + b.abs()
         return (ROUND_OFF * sizes / norms).detach()
 
     def _scaled(self) -> tuple[Tensor, Tensor, Tensor]:
-        """The rows, exactly scaled to about unit length by powers of two, and their norms then."""
+        """A and b, scaled exactly by powers of two to rows of about unit length, and the norms of the scaled rows."""
         scale = power_of_two(self.A)
         A = self.A / scale.unsqueeze(-1)
         return A, self.b / scale, _root_of_squares(A)
 
     def contains(self, z: Float[Tensor, "*batch n"], tolerance: float = 0.0) -> Bool[Tensor, "*batch"]:
-        """Is z inside, up to a distance `tolerance` (units of z)?"""
+        """Is z inside the set, or outside by a distance of at most `tolerance` (units of z)?"""
         return (self.slack(z) >= -tolerance).all(-1)
 
 
 def dot(v: Float[Tensor, "*#batch n"], w: Float[Tensor, "*#batch n"]) -> Float[Tensor, "*#batch"]:
-    """v.w, faster than a product of many small matrices, and rounded alike in every batch."""
+    """The inner product v.w. It is faster than a product of many small matrices, and rounds alike in every batch."""
     products = (v * w).unbind(-1) if v.shape[-1] else (torch.zeros_like(v).sum(-1),)
     return sum(products[1:], start=products[0])
 
 
 def lengths(rows: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
-    """|a|, with 1 for zero rows: no square leaves the floating-point numbers, and the gradient is finite everywhere."""
+    """The lengths |a|; zero rows give 1. No square over- or underflows, and the gradient is finite everywhere."""
     scale = power_of_two(rows)
     return scale * _root_of_squares(rows / scale.unsqueeze(-1))
 
 
 def power_of_two(rows: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
-    """A power of two about as large as the largest entry of each row; 1 for zero rows and rows that are not finite."""
+    """A power of two about as large as the largest entry of each row. Zero rows and rows that are not finite give 1."""
     largest = rows.detach().abs().amax(-1) if rows.shape[-1] else rows.detach().sum(-1)
     scale = largest / (2 * torch.frexp(largest).mantissa)
     return torch.where((largest > 0) & scale.isfinite() & (scale > 0), scale, 1.0)
@@ -140,10 +147,10 @@ def _root_of_squares(rows: Tensor) -> Tensor:
 
 
 def finite(*tensors: Tensor) -> bool:
-    """Are all numbers finite? Their sum is, unless it overflows."""
+    """Are all numbers finite? The sum is tested first, because it is finite unless a number is not or it overflows."""
     return all(math.isfinite(float(t.detach().sum())) or bool(t.isfinite().all()) for t in tensors)
 
 
 def array(tensor: Tensor) -> np.ndarray:
-    """The tensor as the kernels take it: on the CPU, contiguous, without a copy if it is."""
+    """The tensor as a contiguous array on the CPU, which kernels take. It is copied only if it is not one already."""
     return np.ascontiguousarray(tensor.numpy(force=True))

@@ -1,4 +1,4 @@
-"""What came of something, item by item: the answers of sets, programmes, filters and observers. No torch here."""
+"""Outcomes and statuses of sets, programmes, filters and observers, one for each item. This file needs no torch."""
 
 from __future__ import annotations
 
@@ -6,48 +6,50 @@ from enum import IntEnum
 
 
 class Outcome(IntEnum):
-    """What an intersection came to: a three-way answer, so that round-off is never taken for knowledge."""
+    """Is an intersection empty? There are three answers, because round-off may leave it undecided."""
 
     NONEMPTY = 0
     UNDECIDED = 1
-    """The sets touch within round-off: emptiness cannot be decided, and an outer set is kept."""
+    """The sets touch within round-off, so that emptiness cannot be decided. An outer set is kept."""
     EMPTY = 2
 
 
 class ProgrammeStatus(IntEnum):
-    """What became of one item of a batch; where there is no answer, its value is NaN and its gradient zero."""
+    """The status of a programme for one item of a batch. Without an answer, its value is NaN and its gradient zero."""
 
     OK = 0
     EMPTY = 1
-    """No point satisfies the rows. The inscribed ball has a negative radius then: minus the depth, the least distance
-    by which all rows have to be moved outward (-inf: a row 0.z <= b with b < 0)."""
+    """No point satisfies the rows. The radius of the inscribed ball is then minus the depth of the contradiction: the
+    least distance by which all rows have to be moved outward. It is -inf if a row 0.z <= b has b < 0."""
     UNBOUNDED = 2
-    """Of the inscribed ball: there is no largest one (radius inf), or its centre can roll away to infinity."""
+    """Inscribed ball only. There is no largest ball (radius inf), or the centres of the largest balls are unbounded."""
     DEGENERATE = 3
-    """Of the inscribed ball: its radius is zero within round-off, the set has no interior."""
+    """Inscribed ball only. The radius is zero within round-off: the set has no interior."""
     UNDEFINED = 4
     """A row or the point is NaN or infinite, or the metric is not positive definite."""
     UNSOLVED = 5
-    """No answer could be verified, not even one in rational arithmetic: numbers of very different sizes meet.
-    Ask nearer to the origin and in other units (shifted and scaled until the set's width is about 1)."""
+    """No answer could be verified, not even one in rational arithmetic. Cause: the numbers have very different sizes.
+    Remedy: shift the set to the origin and choose units in which its width is about 1."""
 
 
 class FilterStatus(IntEnum):
-    """What the last measurement did to a robot's filter."""
+    """The status of a robot's filter after the last measurement."""
 
     OK = 0
     PREDICTED = 1
-    """It says nothing about theta: the robot was not seen, or the motion up to it is not known (as at first sight)."""
+    """The measurement says nothing about theta: the robot was not seen, or its motion up to now is not known. The first
+    measurement always has this status."""
     REPAIRED = 2
     """The covariance had lost definiteness and was repaired."""
     FAILED = 3
-    """Its numbers overflowed, or its covariance could not be factored: time step, spread of the prior and position
-    noise are too far out of proportion (milliseconds read as seconds, say). It starts again from its prior. Remedy: the
-    units of time and length, a smaller spread, more position noise. The set does not depend on it."""
+    """The filter's numbers overflowed, or its covariance could not be factored. It starts again from its prior.
+    Cause: time step, spread of the prior and position noise are out of proportion (milliseconds read as seconds, say).
+    Remedy: correct the units of time and length, choose a smaller spread or a larger position noise.
+    The set does not depend on the filter."""
 
 
 class HybridStatus(IntEnum):
-    """How the hybrid observer brought a robot's estimate into its set."""
+    """How the hybrid observer projected a robot's estimate onto its set."""
 
     OK = 0
     """Nearest point in the metric of the filter's covariance."""
@@ -62,6 +64,8 @@ class Status(IntEnum):
 
     OK = 0
     ALARM = 1
-    """A hard row was violated by more than its bound: the model or the bounds are wrong."""
+    """A hard row was violated by more than its bound. Cause: the model is wrong or a bound is too small.
+    Remedy: check the barriers, or declare larger bounds."""
     INCONSISTENT = 2
-    """An intersection came out empty: no parameter explains the measurements."""
+    """An intersection was empty: no parameter explains the measurements. Cause: the model, the prior or a bound is
+    wrong, or the robot changed its task. Remedy: check them, or let the observer reset its sets."""

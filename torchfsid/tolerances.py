@@ -1,4 +1,4 @@
-"""Every tolerance that more than one file needs, once, with its unit. No torch here, for the kernels."""
+"""The tolerances that several files share, each with its unit. The kernels read them, so this file needs no torch."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ VERIFIED = 16 * ROUND_OFF
 """Relative residual up to which the conditions of a solution hold: feasibility, stationarity, complementarity."""
 
 CLEARLY_EMPTY = 1e5
-"""Bounds that contradict each other by more than this times their round-off do so in whatever arithmetic."""
+"""Bounds that contradict each other by more than this times their round-off also contradict in exact arithmetic."""
 
 MOST_ROUNDS = 50
 """Rounds per row and dimension after which a search gives up. A few rounds per dimension are usual."""

@@ -3,23 +3,24 @@ r"""Which rows of A z <= b are active at the solution of two convex programmes: 
     nearest point     min 1/2 |z|^2   s.t.  a_j.z <= b_j              at most p active rows
     inscribed ball    max r           s.t.  a_j.z + r <= b_j          p + 1 active rows, w = (z, r)
 
-The rows a_j are unit ones. Both are dual active-set methods: every iterate solves its own active rows exactly, and the
-row that it violates most enters, until none is violated.
+The rows a_j have unit length. Both searches are dual active-set methods: every iterate solves its own active rows
+exactly, and the row that it violates most enters, until none is violated.
 
-The nearest point is found after Goldfarb and Idnani (Math. Programming 27, 1983). The active rows are made orthogonal
-one by one, a_s = Q_s + sum_i<s T_si Q_i. An entering row n is n = sum_s c_s a_s + d, d orthogonal to all of them.
-Pushing it by t changes the multipliers by -t c and its violation by -t |d|^2. A multiplier that reaches zero first
-leaves. If d = 0 and no multiplier can leave, then n - sum_s c_s a_s = 0 combines rows with weights >= 0, and their
-bounds contradict each other: the set is empty.
+The nearest point is found by the method of Goldfarb and Idnani (Math. Programming 27, 1983). The active rows are made
+orthogonal one by one, a_s = Q_s + sum_i<s T_si Q_i. An entering row n is n = sum_s c_s a_s + d, d orthogonal to all of
+them. A step of length t changes the multipliers by -t c and the row's violation by -t |d|^2. The row whose multiplier
+reaches zero first leaves. If d = 0 and no row can leave, then n - sum_s c_s a_s = 0 combines rows with weights >= 0
+whose bounds contradict each other: the set is empty.
 
-The inscribed ball is found by the dual simplex method with lexicographic ratios. They cannot cycle, and they make the
-answer unique: of all centres, the one with the smallest z_1, among these the one with the smallest z_2, and so on. It
-starts from a simplex around everything, infinitely far away, whose sides are replaced by rows that face the same way: a
-number is a finite part, and a rate at which it grows with the distance of the simplex.
+The inscribed ball is found by the dual simplex method with lexicographic ratios. These prevent cycles and make the
+answer unique: of all centres, the one with the smallest z_1, among these the one with the smallest z_2, and so on. The
+search starts from a simplex around all points, infinitely far away. Its sides are replaced at once by rows that face
+the same way, where there are any. So every number has two parts: a finite one, and a rate at which it grows with the
+distance of the simplex.
 
 A pivot that round-off cannot tell from zero is never taken. `epsilon` is the round-off of the arithmetic: `ROUND_OFF`
-for floating point; 0 for exact rationals, for which the same functions are called without being compiled
-(`programmes.rational`). That is why there is no square root here, and why sums start from an integer.
+for floating point, 0 for exact rationals. For rationals the same functions are called uncompiled
+(`programmes.rational`). Therefore they take no square root, and their sums start from an integer.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ OK, EMPTY, UNSOLVED = int(ProgrammeStatus.OK), int(ProgrammeStatus.EMPTY), int(P
 @item
 @no_type_check
 def excess(A, b, row, z):
-    """a.z - b of a row."""
+    """The value a.z - b of one row."""
     over = -b[row]
     for j in range(len(z)):
         over += A[row, j] * z[j]
@@ -52,7 +53,7 @@ def excess(A, b, row, z):
 @item
 @no_type_check
 def most_violated(A, b, z):
-    """The row with the largest a.z - b; rows without a bound never."""
+    """The row with the largest a.z - b, and that value. Rows with an infinite bound are ignored."""
     worst, row = -np.inf, -1
     for j in range(len(b)):
         over = excess(A, b, j, z)
@@ -69,16 +70,17 @@ def nearest_rows(A, b, sizes, epsilon, rows, Q, D, T, work, z):
     Args:
         A: (m, p), unit rows.
         b: (m,), infinite for rows to ignore.
-        sizes: (m,), the size of the numbers that each b was computed from: its round-off is ROUND_OFF times that.
+        sizes: (m,), the size of the numbers that each b was computed from. Its round-off is ROUND_OFF times that.
         epsilon: the round-off of the arithmetic.
         rows: (p,), to be filled with the active rows.
-        Q, T: (p, p), scratch.
+        Q: (p, p), scratch.
         D: (p,), scratch.
+        T: (p, p), scratch.
         work: (6, p), scratch.
         z: (p,), to be filled with the point.
 
     Returns:
-        How many rows are active, and OK, EMPTY or UNSOLVED.
+        The number of active rows, and the status OK, EMPTY or UNSOLVED.
     """
     m, p = A.shape
     y, c, e, d, held, right = work[0], work[1], work[2], work[3], work[4], work[5]
@@ -146,7 +148,7 @@ def nearest_rows(A, b, sizes, epsilon, rows, Q, D, T, work, z):
 @item
 @no_type_check
 def facing_rows(A, b, simplex, basis):
-    """For each side of the simplex the nearest row that faces the same way, or, if there is none, the side."""
+    """Fill `basis`: for each side of the simplex the nearest row that faces the same way, or the side if none does."""
     m, n = A.shape
     for s in range(n):
         basis[s], nearest = m + s, np.inf
@@ -162,20 +164,21 @@ def facing_rows(A, b, simplex, basis):
 @item
 @no_type_check
 def inscribed_rows(A, b, simplex, epsilon, basis, M, V, work, able):
-    """The largest ball, w = (z, r) and the rate `far` at which it grows with the simplex, and the rows that decide it.
+    """The largest ball w = (z, r), the rate `far` at which it grows with the simplex, and the rows that decide it.
 
     Args:
         A: (m, p + 1), the rows (a_j, 1), a_j of unit length.
         b: (m,), infinite for rows to ignore.
         simplex: (p + 1, p + 1), the rows of the simplex.
         epsilon: the round-off of the arithmetic.
-        basis: (p + 1,), to be filled with the rows; m and above: sides of the simplex.
-        M, V: (p + 1, p + 1), to be filled; V is the inverse of the rows (a, 1), its last row the multipliers.
-        work: (5, p + 1), to be filled: right, share, w, far, scratch.
+        basis: (p + 1,), to be filled with the rows. Indices from m on stand for sides of the simplex.
+        M: (p + 1, p + 1), scratch.
+        V: (p + 1, p + 1), to be filled with the inverse of the rows (a, 1). Its last row holds the multipliers.
+        work: (5, p + 1), to be filled with right, share, w, far and scratch.
         able: (p + 1,), scratch of booleans.
 
     Returns:
-        Did the search end?
+        Whether the search has ended.
     """
     m, n = A.shape
     right, share, w, far, noise = work[0], work[1], work[2], work[3], work[4]
@@ -191,7 +194,7 @@ def inscribed_rows(A, b, simplex, epsilon, basis, M, V, work, able):
         regular, enclosed = invert(M, V), True
         for s in range(n):
             enclosed = enclosed and V[n - 1, s] > ROUND_OFF
-        if count == 0 and not (regular and enclosed):  # these rows hold no ball: from the simplex itself
+        if count == 0 and not (regular and enclosed):  # these rows bound no ball: start from the simplex
             for s in range(n):
                 basis[s] = m + s
             continue
@@ -203,7 +206,7 @@ def inscribed_rows(A, b, simplex, epsilon, basis, M, V, work, able):
                 w[i] += V[i, s] * right[s]
                 if basis[s] >= m:
                     far[i] += V[i, s]
-        for s in range(n):  # one correction: the rows of a sharp corner hold to round-off then
+        for s in range(n):  # one correction, so that the rows of a sharp corner hold to round-off
             share[s] = right[s]
             for i in range(n):
                 share[s] -= (A[basis[s], i] if basis[s] < m else simplex[basis[s] - m, i]) * w[i]
@@ -256,8 +259,11 @@ def inscribed_rows(A, b, simplex, epsilon, basis, M, V, work, able):
 @item
 @no_type_check
 def leaving(V, share, able, tie):
-    """The place in the basis that goes, among those `able` to: the first to lose its multiplier, among those the first
-    to let z_1 grow, and so on, among those the largest pivot; -1: none is able to."""
+    """The place in the basis that leaves, among those that are `able` to; -1 if none is.
+
+    It is the first whose multiplier reaches zero. Ties are broken by z_1, then by z_2, and so on, and last by the
+    largest pivot.
+    """
     n = len(share)
     for key in range(-1, n - 1):
         lowest, left, size = np.inf, 0, 0

@@ -1,12 +1,12 @@
 """How kernels are compiled, and where the compiled code is kept.
 
-A kernel is written twice over: an `item` function does the work for one item (one polygon, one set of rows), on arrays
-that it is given, without allocating any; a `launcher` allocates, loops over the items of a batch, and is what torch
-code calls. Items are plain Python functions until a launcher is compiled, so the same source can be called from another
-launcher, of another machine.
+A kernel has two kinds of functions. An `item` function does the work for one item (one polygon, one set of rows). It
+works on arrays that it is given and allocates none. A `launcher` allocates arrays and loops over the items of a batch.
+Torch code calls launchers only. Items stay plain Python functions until a launcher is compiled, so that launchers for
+another device can use the same source.
 
-Compiled code is kept in a folder whose name is a fingerprint of the kernels' sources: an edit anywhere in this room, or
-in the tolerances, never meets code that was compiled before it. So kernels take tolerances and enums as globals.
+The name of the folder with compiled code is a fingerprint of the kernels' sources and of the tolerances. After an edit
+of either, old compiled code is never used. So kernels can take tolerances and enums as globals.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ _OPTIONS: dict[str, Any] = {"error_model": "numpy"}  # a division by zero is inf
 
 
 def item(function: Callable) -> Any:
-    """A function of one item: compiled into every launcher that calls it.
+    """Mark a function of one item, which is compiled into every launcher that calls it.
 
-    Without reference counts (`_nrt`), so it cannot allocate; counting those of slices took half of the time.
+    It keeps no reference counts (`_nrt`), since those of slices took half of the time. So it cannot allocate arrays.
     """
     return register_jitable(**_OPTIONS, _nrt=False)(function)
 
 
 def item_of_ordered(function: Callable) -> Any:
-    """An `item` whose minima and maxima are of finite numbers, in any order: these compile to vector instructions."""
+    """Mark an `item` whose minima and maxima are those of finite numbers. They compile to vector instructions."""
     return register_jitable(**_OPTIONS, fastmath={"nnan", "nsz"})(function)
 
 
 def launcher(function: Callable) -> Any:
-    """A loop over the items of a batch, compiled on first use and kept in `folder()`."""
+    """Mark a loop over the items of a batch. It is compiled on first use and kept in `folder()`."""
     before = numba.config.CACHE_DIR  # type: ignore[attr-defined]
     kept = _is_writable(folder())
     numba.config.CACHE_DIR = str(folder()) if kept else before  # type: ignore[attr-defined]
@@ -52,7 +52,7 @@ def launcher(function: Callable) -> Any:
 
 @cache
 def folder() -> Path:
-    """Where the compiled code of these sources is kept: below NUMBA_CACHE_DIR or the user's cache folder."""
+    """The folder with the compiled code of these sources, below NUMBA_CACHE_DIR or the user's cache folder."""
     package = Path(__file__).parent.parent
     sources = [*sorted((package / "kernels").glob("*.py")), package / "tolerances.py", package / "outcome.py"]
     fingerprint = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:16]

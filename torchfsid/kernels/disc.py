@@ -5,9 +5,9 @@ normals span the plane; with the weights w_i = n_j x n_k >= 0 (j, k the two rows
 
     w_0 n_0 + w_1 n_1 + w_2 n_2 = 0,      r = (w_0 c_0 + w_1 c_1 + w_2 c_2) / W      (an upper bound of every radius).
 
-The row that the disc violates most enters. It lies between two of the normals, and the one of the two leaves that makes
-the three span the plane again; if either does (the third normal is opposite), the one that leaves the larger W. So
-no basis is singular unless all normals of the polygon are parallel to round-off.
+The row that the disc violates most enters. Its normal lies between two normals of the basis, and one of these two
+leaves, such that the remaining three span the plane. If both choices do (the third normal is opposite), the choice with
+the larger W is taken. So no basis is singular unless all normals of the polygon are parallel to round-off.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from torchfsid.tolerances import ROUND_OFF
 @item
 @no_type_check
 def _turn(rows, i, j):
-    """n_i x n_j, to a relative error: through n_j - n_i or n_j + n_i, which are exact where the rows are parallel."""
+    """The product n_i x n_j with a small relative error: n_j - n_i or n_j + n_i is exact for nearly parallel rows."""
     p, q, r, s = rows[i, 0], rows[i, 1], rows[j, 0], rows[j, 1]
     if p * r + q * s > 0:
         return p * (s - q) - q * (r - p)
@@ -34,7 +34,7 @@ def _turn(rows, i, j):
 @item
 @no_type_check
 def inscribed_in(rows, right, n, basis, weight, turned):
-    """A largest disc: (x, y, r, is it one?), and the three rows that decide it into `basis`."""
+    """A largest disc as (x, y, r, found). `basis` is filled with the three rows that decide it."""
     half = 1
     while half < n - 2 and _turn(rows, 0, half + 1) >= 0:
         half += 1
@@ -48,7 +48,7 @@ def inscribed_in(rows, right, n, basis, weight, turned):
             if violation > worst:
                 worst, entering = violation, i
         if not worst > ROUND_OFF * scale:
-            # False, too, if the normals were parallel and nothing is finite.
+            # This is False also if the normals are parallel and the numbers are not finite.
             return x, y, r, worst <= ROUND_OFF * scale
         for s in range(3):
             turned[s] = _turn(rows, basis[s], entering)
@@ -69,7 +69,7 @@ def inscribed_in(rows, right, n, basis, weight, turned):
 @item
 @no_type_check
 def _touching(rows, right, basis, weight):
-    """The disc that touches three rows, and the size of the numbers in it: (x, y, r, size). Their weights."""
+    """The disc that touches three rows, as (x, y, r, size) with the size of the numbers in it. Fills `weight`."""
     total = r = largest = scale = 0.0
     one = other = basis[0]
     for s in range(3):
@@ -78,10 +78,10 @@ def _touching(rows, right, basis, weight):
         total += weight[s]
         r += weight[s] * right[basis[s]]
         scale = max(scale, abs(right[basis[s]]))
-        if weight[s] >= largest:  # the centre is where the two that turn most meet
+        if weight[s] >= largest:  # the centre is computed from the two rows with the largest turn
             largest, one, other = weight[s], j, k
     r /= total
-    # Across and along the first of them: so both hold to round-off, however little they turn.
+    # Solve across and along the first of them: then both hold to round-off, however small the turn.
     across, along = right[one] - r, rows[one, 0] * rows[other, 0] + rows[one, 1] * rows[other, 1]
     along = (right[other] - r - across * along) / largest
     x, y = across * rows[one, 0] - along * rows[one, 1], across * rows[one, 1] + along * rows[one, 0]
@@ -91,17 +91,23 @@ def _touching(rows, right, basis, weight):
 @launcher
 @no_type_check
 def inscribed(vertices, A, b, count):
-    """Of each polygon (vertices (B, V, 2), rows A (B, V, 2), b (B, V), count (B,)) a largest inscribed disc.
+    """A largest inscribed disc of each polygon.
 
-    Returns (centre, radius, basis, found): `basis` (B, 3) are the rows that decide it; where `found` is False, the
-    search has not come to an answer.
+    Args:
+        vertices: (B, V, 2).
+        A: (B, V, 2), the rows of the edges.
+        b: (B, V), their bounds.
+        count: (B,), the number of edges.
+
+    Returns:
+        The centre (B, 2), the radius (B,), the rows that decide them (B, 3), and whether they were found (B,).
     """
     B, V = b.shape
     basis, centre, radius, found = np.zeros((B, 3), np.int64), np.zeros((B, 2)), np.zeros(B), np.zeros(B, np.bool_)
     rows, right, weight, turned = np.empty((V, 2)), np.empty(V), np.empty(3), np.empty(3)
     for k in range(B):
         n, x, y = count[k], 0.0, 0.0
-        for i in range(n):  # about a point of the set, so that small sets far from the origin lose no digits
+        for i in range(n):  # relative to a point of the set, so that small sets far from the origin lose no digits
             x += vertices[k, i, 0] / n
             y += vertices[k, i, 1] / n
         for i in range(n):

@@ -1,11 +1,11 @@
-r"""One measurement of many robots in scalar code: slacks, KKT conditions and half-spaces of theta, in the plane.
+r"""One measurement of many planar robots in scalar code: slacks, KKT conditions and half-spaces of theta.
 
-What `identification` does in torch, one robot after the other; that is the theory, and tests compare the two. The
-active rows are solved along their principal axes: with V a rotation to these axes of the unit active rows A_a, the
-columns of A_a V = [y z] are orthogonal up to round-off, w = z - y (y.z)/(y.y) has the length of the second singular
-value, and
+This computes what `identification` computes in torch, one robot after the other. The theory is explained there, and
+tests compare the two. The active rows A_a, of unit length, are solved along their principal axes. Let V be the rotation
+to these axes. The columns of A_a V = [y z] are orthogonal up to round-off, and w = z - y (y.z)/(y.y) has the length of
+the second singular value. Then
 
-    A_a^+ b_a = V [c1, c2],    c2 = w.b/w.w,   c1 = (y.b - c2 y.z)/y.y        (rank 2; at rank 1 only y counts).
+    A_a^+ b_a = V [c1, c2],    c2 = w.b/w.w,   c1 = (y.b - c2 y.z)/y.y        (rank 2; at rank 1, y alone is used).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ DIRECTIONS, CRITICAL_DIRECTIONS = (
 @item
 @no_type_check
 def is_finite(k, C, d):
-    """Is the nominal control known?"""
+    """Is the nominal control of robot k finite?"""
     known = math.isfinite(d[k, 0]) and math.isfinite(d[k, 1])
     known = known and math.isfinite(C[k, 0, 0]) and math.isfinite(C[k, 0, 1])
     return known and math.isfinite(C[k, 1, 0]) and math.isfinite(C[k, 1, 1])
@@ -37,9 +37,11 @@ def is_finite(k, C, d):
 @item
 @no_type_check
 def judge(k, A, b, hard, u, bound, angles, active_tolerance, unit, unit_b, slack, excess, active, near):
-    """Unit rows, slacks, and which rows are active or may be.
+    """Fill the unit rows, the slacks, the active rows and those that may be active (`near`).
 
-    Returns whether all rows are finite, a hard one is broken, and one that may be active may point anywhere.
+    Returns:
+        Three answers: whether all rows are finite, whether a hard row is violated beyond its bound, and whether a row
+        that may be active has no known direction.
     """
     known, broken, blind, least = True, False, False, bound.shape[1] - 1
     of_bound, uncertain = min(k, len(bound) - 1), angles.shape[1] > 0
@@ -72,7 +74,7 @@ def judge(k, A, b, hard, u, bound, angles, active_tolerance, unit, unit_b, slack
 @item
 @no_type_check
 def solve_active(k, unit, unit_b, active, offset, projector):
-    """A_a^+ b_a and A_a^+ A_a of the active rows; returns (K, rank)."""
+    """Fill A_a^+ b_a and A_a^+ A_a for the active rows. Returns their number K and their rank."""
     K, p, q, r = 0, 0.0, 0.0, 0.0
     for j in range(len(unit_b)):
         if active[k, j]:
@@ -115,7 +117,7 @@ def solve_active(k, unit, unit_b, active, offset, projector):
 @item
 @no_type_check
 def solve_motion(k, C, d, wish_known, rank, offset, projector, free, G, f):
-    """u* = G theta + f, with free = I - P, exactly zero at full rank."""
+    """Fill G and f of u* = G theta + f, and free = I - P, which is exactly zero at full rank."""
     if rank < 2:
         free[k, 0, 0], free[k, 1, 1] = 1 - projector[k, 0, 0], 1 - projector[k, 1, 1]
         free[k, 0, 1], free[k, 1, 0] = -projector[k, 0, 1], -projector[k, 1, 0]
@@ -130,10 +132,19 @@ def solve_motion(k, C, d, wish_known, rank, offset, projector, free, G, f):
 @item
 @no_type_check
 def outward_normals(angle, order, K, none, around, normals, generator):
-    """`kkt.outward_normals` of K generators given by their angles; returns how many normals there are.
+    """Fill the normals of `kkt.outward_normals` for K generators given by their angles.
 
-    `order` names the generators (sorted here, with the angles), `none` stands for no generator, `around` is the fan of
-    a full turn.
+    Args:
+        angle: the generators' angles [rad], sorted here.
+        order: the generators' names, sorted with the angles.
+        K: the number of generators.
+        none: the name for "no generator".
+        around: the fan of a full turn.
+        normals: to be filled with the normals.
+        generator: to be filled with the name of the generator nearest to each normal.
+
+    Returns:
+        The number of normals.
     """
     fan = len(around)
     if K == 0:
@@ -160,7 +171,7 @@ def outward_normals(angle, order, K, none, around, normals, generator):
         first, turn = angle[widest] + PI / 2, max(opening, 0.0)
         v, w, cos, sin = math.cos(first), math.sin(first), math.cos(turn / (fan - 1)), math.sin(turn / (fan - 1))
         for i in range(fan if ray else 1):
-            if ray and i == fan - 1:  # the two ends must be exact, those between only lie there
+            if ray and i == fan - 1:  # the two ends must be exact, those between them need not
                 v, w = math.cos(first + turn), math.sin(first + turn)
             normals[i, 0], normals[i, 1] = v, w
             generator[i] = order[widest if 2 * i < fan - 1 else end]
@@ -176,7 +187,11 @@ def outward_normals(angle, order, K, none, around, normals, generator):
 @item
 @no_type_check
 def find_generators(k, unit, chosen, angles, angle, order):
-    """The angles and names of the chosen rows, each turned by the fractions `SPREAD` of its error; how many?"""
+    """Fill the angles and names of the chosen rows, each turned by the fractions `SPREAD` of its error.
+
+    Returns:
+        The number of generators.
+    """
     K, m, uncertain = 0, len(unit), angles.shape[1] > 0
     for turn in range(len(SPREAD) if uncertain else 1):
         for j in range(m):
@@ -193,7 +208,7 @@ def find_generators(k, unit, chosen, angles, angle, order):
 def critical_region(
     k, unit, unit_b, C, d, G, f, P, offset, active, normals, generator, count, row_A, row_b, row_source
 ):
-    """`critical_region`: the rows that say something."""
+    """The rows of `identification.critical_region` that are not padding."""
     m, R, least = len(unit_b), 0, RANK_TOLERANCE**2
     for j in range(m):
         p, q = unit[j, 0], unit[j, 1]
@@ -217,7 +232,7 @@ def critical_region(
 @item
 @no_type_check
 def inverse_optimal(k, m, u, ball, C, d, normals, generator, count, none, row_A, row_b, row_source):
-    """`inverse_optimal_set`."""
+    """The rows of `identification.inverse_optimal_set` that are not padding."""
     x, y = u[k, 0] - d[k, 0], u[k, 1] - d[k, 1]
     for n in range(count):
         p, q = normals[n, 0], normals[n, 1]
@@ -232,11 +247,23 @@ def inverse_optimal(k, m, u, ball, C, d, normals, generator, count, none, row_A,
 def evidence(A, b, hard, C, d, u, usable, bound, angles, ball, paper, active_tolerance):
     """What a measurement of B robots says about theta, and their KKT conditions.
 
-    `bound` (B or 1, m or 1) is the slack of an active row, `ball` (B or 1,) bounds the error of C theta + d - u.
-    `angles` (B, m) are errors of the rows' directions; (B, 0): there are none. `paper` asks for the critical region.
+    Args:
+        A: (B, m, 2), the rows over the control.
+        b: (B, m), their bounds [m/s].
+        hard: (m,), the rows that no controller may violate.
+        C: (B, 2, p), of the nominal control C theta + d.
+        d: (B, 2), of the nominal control [m/s].
+        u: (B, 2), the measured controls [m/s].
+        usable: (B,), whether the sample may be used.
+        bound: (B or 1, m or 1), the largest slack of an active row [m/s].
+        angles: (B, m), errors of the rows' directions [rad], or (B, 0) if there are none.
+        ball: (B or 1,), a bound on the error of C theta + d - u [m/s].
+        paper: whether the half-spaces are those of the critical region.
+        active_tolerance: the slack below which a row counts as active [m/s].
 
-    Returns half-spaces (A, b, source), padded; (informative, alarmed, slack, excess), as in `Evidence`; and (G, f,
-    projector, free, offset, active, n_active, rank, case), as in `KktSolution`.
+    Returns:
+        Half-spaces (A, b, source), padded. Then (informative, alarmed, slack, excess), as in `Evidence`. Then (G, f,
+        projector, free, offset, active, n_active, rank, case), as in `KktSolution`.
     """
     B, m = b.shape
     fan = angles[:, :0] if paper else angles

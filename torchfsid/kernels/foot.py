@@ -1,4 +1,4 @@
-r"""The nearest point of a polygon in the norm sqrt(z' H z), and its active rows: one polygon at a time."""
+r"""The point of a polygon nearest to a given one in the norm sqrt(z' H z), and the rows active there."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torchfsid.kernels.polygon import after_in, before_in
 @item
 @no_type_check
 def foot_on(vertices, A, b, n, x, y, metric):
-    """(x, y, two active rows): the nearest of the feet on all edges. Rows that are not there are -1."""
+    """The nearest of the feet on all edges as (x, y, row, row), with the active rows. A missing row is -1."""
     inside = True
     for i in range(n):
         inside = inside and A[i, 0] * x + A[i, 1] * y <= b[i]
@@ -41,9 +41,19 @@ def foot_on(vertices, A, b, n, x, y, metric):
 @launcher
 @no_type_check
 def feet(vertices, A, b, count, point, metric):
-    """Of each polygon the one nearest to `point` (B, 2) in the norm of `metric` (B, 2, 2), and its active rows (B, 2).
+    """The point of each polygon nearest to `point` in the norm sqrt(z' metric z), and its active rows.
 
-    No row: the point itself; one: the foot on an edge; two: a vertex. Rows that are not there are -1.
+    Args:
+        vertices: (B, V, 2).
+        A: (B, V, 2), the rows of the edges.
+        b: (B, V), their bounds.
+        count: (B,), the number of edges.
+        point: (B, 2).
+        metric: (B, 2, 2).
+
+    Returns:
+        The nearest points (B, 2) and their active rows (B, 2), a missing one being -1. Without a row it is the point
+        itself, with one the foot on an edge, with two a vertex.
     """
     foot, active = np.empty((len(count), 2)), np.empty((len(count), 2), np.int64)
     for k in range(len(count)):

@@ -1,8 +1,8 @@
-r"""The frame in which a programme over {z : A z <= b} is solved: unit rows, the point y is the origin, the metric I.
+r"""The frame in which a programme over {z : A z <= b} is solved: origin at the point y, metric I, unit rows.
 
     x = L'(z - y),   H = L L',   rows w_j = L^-1 a_j / |L^-1 a_j|
 
-Rows so long or short that their squares leave the floating-point numbers are scaled by powers of two before.
+Rows so long or short that their squares over- or underflow are first scaled by powers of two.
 """
 
 from __future__ import annotations
@@ -25,8 +25,7 @@ SHORT, LONG = 1e-100, 1e100
 @item
 @no_type_check
 def scale_of(A, row):
-    """1 for ordinary rows; for rows so long or short that their squares leave the floating-point numbers, the power of
-    two by which they are multiplied before (exactly)."""
+    """The power of two that scales a row exactly, so that its squares do not over- or underflow; 1 for most rows."""
     largest = 0.0
     for j in range(A.shape[1]):
         largest = max(largest, abs(A[row, j]))
@@ -39,7 +38,7 @@ def scale_of(A, row):
 @item
 @no_type_check
 def cholesky(H, L):
-    """H = L L'. Is H symmetric and positive definite?"""
+    """Fill L of H = L L'. Returns whether H is symmetric and positive definite."""
     p = len(H)
     for j in range(p):
         for i in range(p):
@@ -64,7 +63,7 @@ def cholesky(H, L):
 @item
 @no_type_check
 def whiten(L, v):
-    """v becomes L^-1 v."""
+    """Replace v by L^-1 v."""
     for i in range(len(v)):
         for j in range(i):
             v[i] -= L[i, j] * v[j]
@@ -74,7 +73,7 @@ def whiten(L, v):
 @item
 @no_type_check
 def unwhiten(L, x):
-    """x becomes L'^-1 x."""
+    """Replace x by L'^-1 x."""
     for i in range(len(x) - 1, -1, -1):
         for j in range(i + 1, len(x)):
             x[i] -= L[j, i] * x[j]
@@ -84,16 +83,21 @@ def unwhiten(L, x):
 @item
 @no_type_check
 def to_frame(A, b, y, L, metric, unit, offsets, sizes, lengths):
-    """The rows in the frame of the point y and the metric L L' (`metric`: is there one?).
+    """Fill the rows in the frame of the point y and the metric L L'.
 
     Args:
+        A: (m, p), the rows.
+        b: (m,), their bounds.
+        y: (p,), the point.
+        L: (p, p), the Cholesky factor of the metric.
+        metric: whether there is a metric; without one it is the identity.
         unit: (m, p), to be filled with unit rows, 0 for zero rows.
         offsets: (m,), to be filled with bounds, infinite for zero rows.
         sizes: (m,), to be filled with the sizes of the numbers behind the offsets.
-        lengths: (m, 2), to be filled: a row's power of two, and what is left of its length in the frame.
+        lengths: (m, 2), to be filled with each row's power of two and the length of the scaled row in the frame.
 
     Returns:
-        UNDEFINED if a number is not finite, EMPTY if a row 0.z <= b has b < 0, else OK.
+        UNDEFINED if a number is not finite, EMPTY if a row 0.z <= b has b < 0, OK otherwise.
     """
     m, p = A.shape
     status = OK
@@ -129,7 +133,7 @@ def to_frame(A, b, y, L, metric, unit, offsets, sizes, lengths):
 @item
 @no_type_check
 def from_frame(L, metric, y, z, x):
-    """x = L'(z - y). Returns the size of the numbers that it was computed from."""
+    """Fill the point z of x = L'(z - y). Returns the size of the numbers that z was computed from."""
     p, size = len(x), 0.0
     for i in range(p):
         x[i] = z[i] - y[i]
@@ -148,7 +152,7 @@ def from_frame(L, metric, y, z, x):
 @item
 @no_type_check
 def distance(A, b, row, z, lengths):
-    """(a.z - b) / |a| of a row, with the lengths as `to_frame` gives them."""
+    """The value (a.z - b) / |a| of one row, with the lengths from `to_frame`."""
     scale = lengths[row, 0]
     over = -b[row] * scale
     for j in range(len(z)):

@@ -2,8 +2,8 @@ r"""Implicit differentiation of the two programmes: the active rows' linear syst
 
     H z + N' mu = pull,   N z = offsets
 
-The matrix of this system is symmetric: the derivative of a solution, and its adjoint, are solutions for the same rows.
-For the inscribed ball N is square, with the rows (a_j, |a_j|), and there is no metric.
+The matrix of this system is symmetric. So the derivative of a solution and its adjoint solve the same system with
+another right-hand side. For the inscribed ball, N is square with the rows (a_j, |a_j|), and there is no metric.
 """
 
 from __future__ import annotations
@@ -24,15 +24,22 @@ OK = int(ProgrammeStatus.OK)
 @item
 @no_type_check
 def solve_given(N, k, pull, offsets, L, metric, rows, Q, D, T, work, z, mu):
-    """H z + N' mu = pull, N z = offsets, for the first k rows of N, of any length.
+    """Solve H z + N' mu = pull, N z = offsets for the first k rows of N, which may have any length.
 
     Args:
-        N: the rows, (k or more, p).
+        N: (k or more, p), the rows.
+        k: the number of rows that are used.
         pull: (p,), the right-hand side of stationarity.
         offsets: (k or more,), the bounds.
-        L, metric: H = L L', and whether there is a metric.
-        rows, Q, D, T, work: scratch.
-        z, mu: to be filled.
+        L: (p, p), the Cholesky factor of H = L L'.
+        metric: whether there is a metric; without one, H is the identity.
+        rows: scratch.
+        Q: scratch.
+        D: scratch.
+        T: scratch.
+        work: scratch.
+        z: (p,), to be filled.
+        mu: (k or more,), to be filled.
     """
     right, given = work[3], work[4]
     for s in range(k):
@@ -56,8 +63,10 @@ def solve_given(N, k, pull, offsets, L, metric, rows, Q, D, T, work, z, mu):
 @launcher
 @no_type_check
 def solve_active(N, filled, pull, offsets, H, z, mu):
-    """H z + N' mu = pull, N z = offsets, for the first rows of N, `filled`: fills the last two.
-    H: (B, p, p), or (0, p, p) for the identity."""
+    """Solve H z + N' mu = pull, N z = offsets for each item, with the rows of N that are `filled`, its first ones.
+
+    H is (B, p, p), or (0, p, p) for the identity. The results z and mu are filled.
+    """
     B, n, p = N.shape
     metric = len(H) > 0
     L, Q, T, rows = np.zeros((p, p)), np.zeros((n, p)), np.zeros((n, n)), np.zeros((n, p))
@@ -76,7 +85,10 @@ def solve_active(N, filled, pull, offsets, H, z, mu):
 @launcher
 @no_type_check
 def nearest_point_vjp(A, rows, filled, mu, z, status, grad_z, grad_mu, grad_A, grad_b, grad_y):
-    """The vector-Jacobian products of the Euclidean nearest point: fills the last three, which are zero before."""
+    """The vector-Jacobian products of the Euclidean nearest point.
+
+    They are added to `grad_A`, `grad_b` and `grad_y`, which have to be zero before.
+    """
     B, p = z.shape
     L, Q, T, N, scaled = np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p))
     D, work, u, v = np.zeros(p), np.zeros((6, p)), np.zeros(p), np.zeros(p)
@@ -100,7 +112,7 @@ def nearest_point_vjp(A, rows, filled, mu, z, status, grad_z, grad_mu, grad_A, g
 @launcher
 @no_type_check
 def inscribed_ball_vjp(A, centre, radius, rows, simplex, grad_centre, grad_radius, grad_A, grad_b):
-    """The vector-Jacobian products of the largest ball: fills the last two, which are zero before."""
+    """The vector-Jacobian products of the largest ball. They are added to `grad_A` and `grad_b`, zero before."""
     B, m, p = A.shape
     n = p + 1
     L, Q, T, N, scaled = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))

@@ -1,7 +1,7 @@
-r"""Small linear systems in scalar code: rows made orthogonal one by one, and inverses.
+r"""Small linear systems in scalar code: orthogonalisation row by row, and inverses.
 
-The rows a_s are written as a_s = Q_s + sum_i<s T_si Q_i, with orthogonal Q_i and D_i = 1 / |Q_i|^2. There is no square
-root, and sums start from an integer: called as plain Python, the functions compute with exact rationals as well.
+The rows a_s are written as a_s = Q_s + sum_i<s T_si Q_i, with orthogonal Q_i and D_i = 1 / |Q_i|^2. The functions take
+no square root, and their sums start from an integer. So they also compute with exact rationals, called uncompiled.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ def dot(v, w):
 @item
 @no_type_check
 def orthogonalise(v, Q, D, k, share):
-    """Take from v what lies in the span of the first k rows of Q: v loses share_i Q_i. D_i = 1 / |Q_i|^2.
+    """Subtract from v its component in the span of the first k rows of Q, the sum of share_i Q_i.
 
-    Twice, if little is left, so that what is left is orthogonal to round-off.
+    It is done twice if little is left, so that the remainder is orthogonal to round-off.
 
     Returns:
-        |v|^2, of what is left.
+        |v|^2 of the remainder.
     """
     square, left = 0, 0
     for j in range(len(v)):
@@ -56,7 +56,7 @@ def orthogonalise(v, Q, D, k, share):
 @item
 @no_type_check
 def solve_upper(T, right, k, x):
-    """sum_s x_s a_s = sum_i right_i Q_i for the k rows a_s = Q_s + sum_i<s T_si Q_i."""
+    """Solve sum_s x_s a_s = sum_i right_i Q_i for x, with the k rows a_s = Q_s + sum_i<s T_si Q_i."""
     for i in range(k - 1, -1, -1):
         x[i] = right[i]
         for j in range(i + 1, k):
@@ -66,7 +66,7 @@ def solve_upper(T, right, k, x):
 @item
 @no_type_check
 def on_rows(b, Q, D, T, k, y, z):
-    """z = sum_i y_i Q_i with a_s.z = b_s for the k rows a_s = Q_s + sum_i<s T_si Q_i."""
+    """Find z = sum_i y_i Q_i with a_s.z = b_s for the k rows a_s = Q_s + sum_i<s T_si Q_i."""
     for j in range(len(z)):
         z[j] = 0
     for s in range(k):
@@ -83,8 +83,11 @@ def on_rows(b, Q, D, T, k, y, z):
 @item
 @no_type_check
 def solve_rows(N, k, pull, offsets, Q, D, T, work, z, mu):
-    """z + N' mu = pull, N z = offsets for the first k rows of N: in the span of the rows z follows from the offsets,
-    beyond it from the pull. A row that depends on those before it counts for nothing."""
+    """Solve z + N' mu = pull, N z = offsets for the first k rows of N.
+
+    In the span of the rows, z follows from the offsets. Orthogonal to it, z follows from the pull. A row that depends
+    linearly on earlier ones is ignored.
+    """
     p = len(z)
     y, e, d = work[0], work[1], work[2]
     for s in range(k):
@@ -106,7 +109,7 @@ def solve_rows(N, k, pull, offsets, Q, D, T, work, z, mu):
 @item
 @no_type_check
 def invert(M, V):
-    """V = M^-1 by Gauss and Jordan with row exchanges; M is lost. Is M regular?"""
+    """Fill V = M^-1 by Gauss-Jordan elimination with row exchanges. M is overwritten. Returns whether M is regular."""
     k = len(M)
     for i in range(k):
         for j in range(k):

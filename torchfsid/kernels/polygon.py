@@ -1,13 +1,13 @@
 r"""Polygons cut by half-spaces a.z <= c: the search for the rows that form the ring, one polygon at a time.
 
-Of the rows that some vertex exceeds by more than round-off, the one that cut deepest at first cuts next. Let v be the
-vertices, m = min a.v - c, and t the round-off of a.v - c:
+A row cuts if some vertex exceeds it by more than round-off. The rows cut in the order of their depth in the polygon as
+it was at first, deepest first. Let v be the vertices, m = min a.v - c, and t the round-off of a.v - c:
 
     m < -2t   the row cuts: the vertices with a.v - c <= t are kept, one arc of the ring, and the arc is closed where
               the ring crosses the line
     m > t     every vertex is beyond. EMPTY, if the row provably contradicts the two edges at the nearest vertex
     else      the row only touches, or nothing is proven. It is moved outward until the nearest vertex is 2t inside,
-              and then it cuts: what is left is an outer sliver. UNDECIDED where -t <= m.
+              and then it cuts. An outer sliver is left. UNDECIDED where -t <= m.
 
 So no row is ever forgotten, and none is applied tighter than it was given.
 """
@@ -41,7 +41,7 @@ def _box(vertices, k, n):
 @item_of_ordered
 @no_type_check
 def _beyond(vertices, k, n, p, q, c):
-    """How far the vertices reach beyond the line (p, q).z = c."""
+    """The largest distance by which a vertex exceeds the line (p, q).z = c."""
     most = -np.inf
     for i in range(n):
         beyond = p * vertices[k, i, 0] + q * vertices[k, i, 1] - c
@@ -52,8 +52,9 @@ def _beyond(vertices, k, n, p, q, c):
 @item
 @no_type_check
 def mark_cuts(vertices, k, n, reach, A, b, tolerance, depth, cutting):
-    """Mark the rows that some vertex of polygon k exceeds by more than round-off. The bounding box spares many of them
-    the loop. (Most polygons come no further: the arrays of the batch are indexed, for a view of each would cost more.)
+    """Mark the rows that some vertex of polygon k exceeds by more than round-off.
+
+    The bounding box rules out many rows without a loop. The arrays of the batch are indexed, since views cost more.
     """
     x0, x1, y0, y1 = _box(vertices, k, n)
     found = False
@@ -71,7 +72,7 @@ def mark_cuts(vertices, k, n, reach, A, b, tolerance, depth, cutting):
 @item_of_ordered
 @no_type_check
 def _excess(ring, n, p, q, c, over):
-    """(p, q).v - c of each vertex into `over`; the largest of them."""
+    """Fill `over` with (p, q).v - c of each vertex. Returns the largest of them."""
     most = -np.inf
     for i in range(n):
         beyond = p * ring[i, 0] + q * ring[i, 1] - c
@@ -85,9 +86,9 @@ def _excess(ring, n, p, q, c, over):
 def cut_ring(ring, edge, n, lines, first_row, reach, tolerance, depth, cutting, over, spare, spare_edge):
     """Cut the ring of n vertices by the rows marked `cutting`, the deepest first.
 
-    `edge` numbers the lines (p, q, c); row r is line first_row + r. Where a row has to be moved outward, its line is.
+    `edge` holds indices of lines (p, q, c). Row r is line first_row + r. A row is moved outward by changing its line.
 
-    Returns (n, outcome, is the ring smaller; for EMPTY, the three lines that contradict each other).
+    Returns (n, outcome, whether the ring is smaller, and three lines that contradict each other if it is EMPTY).
     """
     outcome, shrunk = NONEMPTY, False
     while True:
@@ -124,7 +125,7 @@ def cut_ring(ring, edge, n, lines, first_row, reach, tolerance, depth, cutting, 
 @item
 @no_type_check
 def _keep_arc(ring, edge, n, line, inner, slack, over, spare, spare_edge):
-    """The arc around the vertex `inner` with a.v - c <= slack, closed along the line; the number of its vertices."""
+    """Keep the arc around the vertex `inner` with a.v - c <= slack, closed along the line. Returns its vertex count."""
     first = last = inner
     while over[before_in(first, n)] <= slack:
         first = before_in(first, n)
@@ -152,11 +153,11 @@ def _keep_arc(ring, edge, n, line, inner, slack, over, spare, spare_edge):
 @item
 @no_type_check
 def _contradict(lines, row, first, second, reach):
-    """Is it proven that no point within `reach` satisfies three lines, of which the first is beyond all vertices and
-    the others are the edges at the nearest vertex?
+    """Is it proven that no point within `reach` satisfies three lines? All vertices are beyond the first of them. The
+    others are the edges at the nearest vertex.
 
-    The proof is a y >= 0 with y_row = 1 and y'c + |y'A| reach < 0 by more than round-off: the y for which y'A = 0, or,
-    if one edge alone will do, the y for which |y'A| is least.
+    The proof is a y >= 0 with y_row = 1 and y'c + |y'A| reach < 0 by more than round-off. It is the y with y'A = 0, or
+    the y with the least |y'A| if one edge suffices.
     """
     p, q, c = lines[row, 0], lines[row, 1], lines[row, 2]
     p1, q1, c1 = lines[first, 0], lines[first, 1], lines[first, 2]
@@ -210,9 +211,9 @@ def _cross(points, k, ring, over, inner, outer):
 @item
 @no_type_check
 def merge_ring(ring, edge, n, most, lines, spare, spare_edge):
-    """Drop the edge whose removal adds least area until `most` are left, or none can be dropped.
+    """Drop the edge whose removal adds least area, until `most` edges are left or none can be dropped.
 
-    Its neighbours are extended until they meet. An edge whose neighbours are parallel cannot be dropped.
+    The neighbours of a dropped edge are extended until they meet. An edge with parallel neighbours cannot be dropped.
     """
     while n > most:
         best, dropped, cx, cy = np.inf, -1, 0.0, 0.0
@@ -243,7 +244,7 @@ def merge_ring(ring, edge, n, most, lines, spare, spare_edge):
 @item
 @no_type_check
 def area_of(ring, n):
-    """By the shoelace formula about the first vertex."""
+    """The area by the shoelace formula about the first vertex."""
     total = 0.0
     for i in range(1, n - 1):
         p, q = ring[i, 0] - ring[0, 0], ring[i, 1] - ring[0, 1]
@@ -254,13 +255,13 @@ def area_of(ring, n):
 @launcher
 @no_type_check
 def clip(polygons, A, b, stamp, source, first_label, most):
-    """Cut all polygons by their rows A (B, R, 2), b and source (B, R), stamped (B,).
+    """Cut all polygons by their rows A (B, R, 2), b and source (B, R), with the times `stamp` (B,).
 
-    `polygons` are (vertices, A, b, time, source, label, count, reach), as in `Polygon`. New edges are labelled one by
-    one from `first_label` on, `entered` are their rows k R + r; without labels, `first_label` is 0. Polygons with more
-    than `most` edges are merged, or stay as they were if that costs what the cut has gained.
+    `polygons` are (vertices, A, b, time, source, label, count, reach), as in `Polygon`. New edges are labelled from
+    `first_label` on, and `entered` lists their rows k R + r. A `first_label` of 0 means no labels. Polygons with more
+    than `most` edges are merged. They stay as they were if merging costs what the cut has gained.
 
-    Returns (polygons, outcome, shrunk, entered, contradiction): the same polygons, not copied, if none was cut.
+    Returns (polygons, outcome, shrunk, entered, contradiction). If none was cut, the polygons are not copied.
     """
     vertices, ring_A, ring_b, time, ring_source, label, count, reach = polygons
     (B, R), V = b.shape, ring_b.shape[1]
@@ -295,11 +296,11 @@ def clip(polygons, A, b, stamp, source, first_label, most):
                 lost_source[k, i] = ring_source[k, e] if e < V else source[k, e - V]
         if shrunk[k] and n > most:
             n = merge_ring(ring, edge, n, most, lines, spare, spare_edge)
-            # The areas are sums in some order.
+            # Each area carries the round-off of its sum.
             shrunk[k] = area_of(ring, n) <= area_of(vertices[k], count[k]) * (1 - ROUND_OFF)
         if not shrunk[k]:
             continue
-        if n > slots:  # seldom: room grows by eight, and all polygons are copied
+        if n > slots:  # seldom: slots grow by eight, and all polygons are copied
             slots = max((n + 7) // 8 * 8, V)
             result = _widened(result, slots)
             to_vertices, to_A, to_b, to_time, to_source, to_label, to_count, _ = result
@@ -328,7 +329,7 @@ def clip(polygons, A, b, stamp, source, first_label, most):
 @launcher
 @no_type_check
 def _widened(polygons, slots):
-    """A copy with room for `slots` vertices; new slots repeat the first vertex and carry padding rows."""
+    """A copy with `slots` slots for vertices. New slots repeat the first vertex and hold padding rows."""
     vertices, A, b, time, source, label, count, reach = polygons
     (B, V), wide_count = b.shape, count.copy()
     wide_vertices, wide_A, wide_b = np.empty((B, slots, 2)), np.empty((B, slots, 2)), np.empty((B, slots))

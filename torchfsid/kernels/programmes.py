@@ -5,9 +5,9 @@ r"""Two convex programmes over half-spaces {z : A z <= b}, item by item.
 
 N are the active rows. They are searched for (`active_rows`) in the frame of the point and the metric (`frame`). The
 solution of the active rows is corrected once with the given rows, which removes the round-off of the frame. Then it is
-verified: a_j.z <= b_j for all rows, equality for the active ones, mu >= 0, and stationarity, each up to `VERIFIED`
-times the sizes of the numbers that meet there. What fails has the status UNSOLVED, and `programmes.exact` asks
-`programmes.rational`.
+verified: a_j.z <= b_j for all rows, equality for the active ones, mu >= 0, and stationarity. Each condition must hold
+up to `VERIFIED` times the size of its terms. Otherwise the status is UNSOLVED, and `programmes.exact` solves the item
+in rational arithmetic (`programmes.rational`).
 """
 
 from __future__ import annotations
@@ -34,7 +34,9 @@ IMPOSSIBLE, BOUNDLESS = -1, -2
 @item
 @no_type_check
 def finish_nearest(A, b, y, L, metric, unit, sizes, lengths, rows, k, Q, D, T, work, N, x, z, mu):
-    """From the active rows and the point x in the frame: the point z, the multipliers mu of the given rows, verified.
+    """Fill the point z and the multipliers mu of the given rows, from the active rows and the point x in the frame.
+
+    Both are verified.
 
     Returns:
         OK or UNSOLVED.
@@ -82,7 +84,10 @@ def finish_nearest(A, b, y, L, metric, unit, sizes, lengths, rows, k, Q, D, T, w
 @launcher
 @no_type_check
 def nearest_point(A, b, y, H, z, mu, rows, filled, status):
-    """Fills the last five. H: (B, p, p), or (0, p, p) for the identity."""
+    """The nearest point of each item. Fills `z`, `mu`, `rows`, `filled` and `status`.
+
+    H is (B, p, p), or (0, p, p) for the identity.
+    """
     B, m, p = A.shape
     metric = len(H) > 0
     unit, offsets, sizes, lengths = np.empty((m, p)), np.empty(m), np.empty(m), np.empty((m, 2))
@@ -115,7 +120,7 @@ def nearest_point(A, b, y, H, z, mu, rows, filled, status):
 def has_multipliers(A, simplex, basis, V, least, N, Q, D, T, work):
     """Is (0, .., 0, 1) a combination with weights >= 0 of those rows of the basis whose multiplier is above `least`?
 
-    They are solved anew: the multipliers of nearly parallel rows that do not matter have spoilt those in V.
+    The weights are computed anew. Those in V suffer from nearly parallel rows that do not matter here.
     """
     m, n = A.shape
     pull, offsets, left, mu, k = work[3], work[4], work[5], V[n - 1], 0
@@ -135,14 +140,20 @@ def has_multipliers(A, simplex, basis, V, least, N, Q, D, T, work):
 @item
 @no_type_check
 def finish_ball(A, b, simplex, basis, V, w, far, N, Q, D, T, work):
-    """From the rows that decide the largest ball, in the frame, to its status, verified.
+    """The verified status of the largest ball, given the rows that decide it, in the frame.
 
     Args:
         A: (m, p + 1), the rows (a_j, 1).
         b: (m,), their bounds.
-        simplex, basis, V, w, far: see `inscribed_rows`.
-        N, Q, T: (p + 1, p + 1), scratch.
+        simplex: see `inscribed_rows`.
+        basis: see `inscribed_rows`.
+        V: see `inscribed_rows`.
+        w: see `inscribed_rows`.
+        far: see `inscribed_rows`.
+        N: (p + 1, p + 1), scratch.
+        Q: (p + 1, p + 1), scratch.
         D: (p + 1,), scratch.
+        T: (p + 1, p + 1), scratch.
         work: (6, p + 1), scratch.
     """
     m, n = A.shape
@@ -189,10 +200,10 @@ def finish_ball(A, b, simplex, basis, V, w, far, N, Q, D, T, work):
 @item
 @no_type_check
 def write_ball(w, m, status, centre, rows):
-    """The centre, NaN if there is none, and the rows, none of them real if the radius does not follow from any.
+    """Fill the centre and the rows. The centre is NaN if there is none. No row is real if none decides the radius.
 
     Returns:
-        The radius, and the status without its private values.
+        The radius, and the public status.
     """
     p, radius, is_open = len(centre), w[len(centre)], False
     for s in range(p + 1):
@@ -216,7 +227,7 @@ def write_ball(w, m, status, centre, rows):
 @launcher
 @no_type_check
 def inscribed_ball(A, b, simplex, centre, radius, rows, status):
-    """Fills the last four."""
+    """The largest ball of each item. Fills `centre`, `radius`, `rows` and `status`."""
     B, m, p = A.shape
     unit, offsets, sizes, lengths = np.ones((m, p + 1)), np.empty(m), np.empty(m), np.empty((m, 2))
     M, V, work, able = (

@@ -1,3 +1,3 @@
-"""Two convex programmes over half-spaces, nearest point and inscribed ball: the exact solver with its derivatives, the
-layers, the cvxpylayers backend.
+"""Two convex programmes over half-spaces: nearest point and inscribed ball. This package holds the exact solver with
+its derivatives, the layers, and the cvxpylayers backend.
 """

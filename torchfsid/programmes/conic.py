@@ -2,10 +2,11 @@ r"""cvxpylayers: the two programmes of `programmes` through DIFFCP, and the exac
 
     min |w|^2   s.t.  N w <= o              max rho   s.t.  N w + s rho <= o
 
-Conic solvers and the derivatives of their solutions are good to a tolerance, and only on problems of order one. So the
-rows are unit ones; the exact answer, found first and without gradients, gives the unit of length (the distance from
-the point, or the radius) and for the ball the origin; rows further away than `FAR` units are left out, for none of them
-can be active. Items without an answer are replaced by an easy problem: they would raise for the whole batch.
+Conic solvers and the derivatives of their solutions are accurate to a tolerance, and only on problems of order one. So
+the problem is scaled first. The rows are made unit rows. The exact answer, found without gradients, gives the unit of
+length (the distance from the point, or the radius) and, for the ball, the origin. Rows further away than `FAR` units
+cannot be active and are left out. Items without an answer are replaced by an easy problem, because they would make the
+solver raise for the whole batch.
 """
 
 from __future__ import annotations
@@ -37,11 +38,11 @@ DIFFERENTIATE = {"mode": "dense"}
 
 
 def nearest_point(halfspaces: Halfspaces, point: Tensor, metric: Tensor | None = None) -> NearestPoint:
-    """`programmes.nearest_point` by cvxpylayers.
+    """The nearest point as in `programmes.nearest_point`, by cvxpylayers.
 
     Raises:
         InputError: dimensions or batches do not fit.
-        SolverError: SCS gave up.
+        SolverError: the conic solver SCS failed.
     """
     halfspaces, y, metric = broadcast(halfspaces, point, metric)
     with torch.no_grad():
@@ -68,10 +69,10 @@ def nearest_point(halfspaces: Halfspaces, point: Tensor, metric: Tensor | None =
 
 
 def inscribed_ball(halfspaces: Halfspaces) -> InscribedBall:
-    """`programmes.inscribed_ball` by cvxpylayers; where the centre is not unique, one of the centres.
+    """The largest ball as in `programmes.inscribed_ball`, by cvxpylayers. A centre that is not unique is any of them.
 
     Raises:
-        SolverError: SCS gave up.
+        SolverError: the conic solver SCS failed.
     """
     halfspaces, *_ = broadcast(halfspaces)
     with torch.no_grad():
@@ -104,7 +105,7 @@ def _ball(m: int, p: int) -> CvxpyLayer:
 
 
 def _solve(layer: CvxpyLayer, *tensors: Tensor) -> list[Tensor]:
-    """The layer on the parameters N, o, ..., their leading dimensions flattened to one."""
+    """Apply the layer to the parameters N, o, ..., with their batch dimensions flattened to one."""
     batch = tensors[1].shape[:-1]
     if batch.numel() == 0:
         return [tensors[0].new_zeros((*batch, *v.shape)) for v in layer.ctx.variables or ()]
@@ -118,14 +119,14 @@ def _solve(layer: CvxpyLayer, *tensors: Tensor) -> list[Tensor]:
 
 
 class ActiveRowsSolver(SolverInterface):
-    """The exact solver for quadratic programmes, as `solver=` of a `CvxpyLayer`.
+    """The exact solver for quadratic programmes, given to a `CvxpyLayer` as `solver=`.
 
         min 1/2 x'P x + q'x   s.t.  E x = e,  N x <= o
 
-    P has to be positive definite on the directions that E leaves free, as in projections. An infeasible item is NaN.
+    P has to be positive definite on the null space of E, as in projections. The solution of an infeasible item is NaN.
 
     Raises:
-        InputError: the problem has other constraints, or a linear objective.
+        InputError: the problem has other constraints, or its objective is linear.
     """
 
     canon_solver = "CLARABEL"
@@ -155,13 +156,13 @@ class ActiveRowsSolver(SolverInterface):
         return torch.autograd.grad(solution, inputs, given, allow_unused=True, materialize_grads=True)
 
     def _solve(self, P: Tensor, q: Tensor, A: Tensor) -> tuple[Tensor, Tensor]:
-        """By elimination: x = x0 + Z v, E Z = 0; then v is a nearest point in the metric Z'P Z."""
+        """Solve by elimination: x = x0 + Z v with E Z = 0. Then v is a nearest point in the metric Z'P Z."""
         n, k = q.shape[-1] - 1, self._equalities
         upper, q = self._dense(P, self._P, (n, n)), q[:, :n]
         H = upper + upper.triu(1).mT
         stacked = self._dense(A, self._A, (self._rows, n + 1))
         E, e, N, o = -stacked[:, :k, :n], stacked[:, :k, n], -stacked[:, k:, :n], stacked[:, k:, n]
-        # E, completed by constant rows orthogonal to it, turns x into (e, v).
+        # E is completed by constant rows orthogonal to it. The square matrix maps x to (e, v).
         free = torch.linalg.qr(E.detach().mT, mode="complete").Q[..., k:].mT if k > 0 else torch.eye(n).to(q)
         back = torch.linalg.inv(torch.cat([E, free.expand(len(q), -1, -1)], dim=1))
         x0, Z = times(back[..., :k], e), back[..., k:]
@@ -169,7 +170,7 @@ class ActiveRowsSolver(SolverInterface):
         metric = programmes.symmetric(metric)
         y = -torch.linalg.solve(metric, times(Z.mT, times(H, x0) + q))
         v, mu, rows, filled, status = programmes.nearest(Halfspaces(N @ Z, o - times(N, x0)), y, metric)
-        # NaN elsewhere only at the end: it would spoil shared gradients.
+        # NaN is filled in only at the end: earlier it would spoil shared gradients.
         solved = (status == ProgrammeStatus.OK).unsqueeze(-1)
         x = x0 + times(Z, torch.where(solved, v, 0.0))
         multipliers = torch.zeros_like(o).scatter_add(-1, rows, torch.where(filled & solved, mu, 0.0))

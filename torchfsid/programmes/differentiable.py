@@ -3,13 +3,14 @@ r"""Two convex programmes over half-spaces {z : A z <= b}, exact and differentia
     nearest_point     min 1/2 (z - y)' H (z - y)   s.t.  A z <= b                (the metric H, I by default)
     inscribed_ball    max r                        s.t.  a_j.z + |a_j| r <= b_j  (the Chebyshev centre z)
 
-The active rows N are found without gradients (`exact`). They alone decide the answer, and its derivatives:
+The active rows N are found without gradients (`exact`). They alone decide the answer. Its derivatives follow from these
+equations by implicit differentiation:
 
     point:  H z + N' mu = H y,  N z = b        ball:  (a_j, |a_j|) w = b_j, p + 1 rows, a square system
 
-Derivatives of any order, forward and backward, are right as long as the active rows stay the same. At a switch, or
-between tied rows (several on one line, more than p through one point), they are those of one side. The matrix N N',
-whose condition is that of the rows squared, is never formed.
+Derivatives of any order, forward and backward, are right as long as the active rows stay the same. Where the active set
+switches, or rows are tied (several on one line, more than p through one point), they are those of one side. The matrix
+N N' is never formed, because its condition number is that of N squared.
 """
 
 from __future__ import annotations
@@ -31,14 +32,14 @@ from torchfsid.programmes.exact import simplex_around
 
 
 class NearestPoint(NamedTuple):
-    """The nearest point, in the type of the point given, and a `ProgrammeStatus`."""
+    """The nearest point, in the dtype of the given point, and a `ProgrammeStatus` for each item."""
 
     point: Float[Tensor, "*batch p"]
     status: Int[Tensor, "*batch"]
 
 
 class InscribedBall(NamedTuple):
-    """Centre and radius of the largest inscribed ball, and a `ProgrammeStatus`."""
+    """Centre and radius of the largest inscribed ball, and a `ProgrammeStatus` for each item."""
 
     centre: Float[Tensor, "*batch p"]
     radius: Float[Tensor, "*batch"]
@@ -58,16 +59,21 @@ def nearest_point(
 
 
 def nearest(halfspaces: Halfspaces, y: Tensor, metric: Tensor | None = None) -> tuple[Tensor, ...]:
-    """The point, the multipliers mu, the active rows, which of their places are filled, and the status, for `broadcast`
-    arguments. The two first have gradients."""
+    """The nearest point for arguments that are already `broadcast`.
+
+    Returns:
+        The point and the multipliers mu, both with gradients. Then the active rows, a mask of the places that they
+        fill, and the status.
+    """
     return _NearestPoint.apply(halfspaces.A, halfspaces.b, y, metric)  # type: ignore[return-value]
 
 
 def inscribed_ball(halfspaces: Halfspaces) -> InscribedBall:
-    """A largest ball inside each set; inside an empty set its radius is negative.
+    """A largest ball inside each set. For an empty set the radius is negative.
 
     Where the centre is not unique, the one with the smallest z_1 is returned, among these the one with the smallest
-    z_2, and so on: its gradient is that of the rows that decide it so. The radius and its gradient are right anyway.
+    z_2, and so on. Its gradient is that of the rows that decide this choice. The radius and its gradient are right in
+    any case.
     """
     halfspaces, *_ = broadcast(halfspaces)
     centre, radius, _, status = _InscribedBall.apply(halfspaces.A, halfspaces.b)  # type: ignore[misc]
@@ -77,7 +83,7 @@ def inscribed_ball(halfspaces: Halfspaces) -> InscribedBall:
 def broadcast(
     halfspaces: Halfspaces, point: Tensor | None = None, metric: Tensor | None = None
 ) -> tuple[Halfspaces, Any, Any]:
-    """Half-spaces with at least one row, point and metric in float64, with one batch shape."""
+    """Half-spaces, point and metric in float64 with one batch shape. The half-spaces get a row if they have none."""
     p = halfspaces.dim
     if halfspaces.rows == 0:
         A, b = halfspaces.A, halfspaces.b
@@ -101,14 +107,14 @@ def broadcast(
 
 
 def symmetric(metric: Float[Tensor, "*batch p p"]) -> Float[Tensor, "*batch p p"]:
-    """The symmetric part, all of a metric that counts: so its gradient is symmetric, and a trained one stays it."""
+    """The symmetric part of a metric. Only this part counts, so the gradient of a metric is symmetric as well."""
     return (metric + metric.mT) / 2
 
 
 def solve_active(
     N: Tensor, filled: Tensor, pull: Tensor, offsets: Tensor, metric: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """z and mu with H z + N' mu = pull, N z = offsets, for the rows `filled` of N, its first ones; with gradients."""
+    """Solve H z + N' mu = pull, N z = offsets for z and mu, with gradients, for the first rows of N, `filled`."""
     return _SolveActive.apply(N, filled, pull, offsets, metric)  # type: ignore[return-value]
 
 
@@ -116,13 +122,13 @@ def solve_active(
 
 
 def _signed(forward: Callable) -> Callable:
-    """autograd asks for the signature of `forward` at every call, and finds it quicker this way."""
+    """Store the signature of `forward`, which autograd reads at every call. This is quicker."""
     forward.__signature__ = signature(forward)  # type: ignore[attr-defined]
     return forward
 
 
 class _NearestPoint(torch.autograd.Function):
-    """(A, b, y, H) -> the point, the multipliers mu, the active rows, the places they fill, the status."""
+    """(A, b, y, H) -> the point, the multipliers mu, the active rows, a mask of the places they fill, the status."""
 
     @staticmethod
     @_signed
@@ -179,7 +185,8 @@ class _NearestPoint(torch.autograd.Function):
 class _SolveActive(torch.autograd.Function):
     """(N, filled, pull, offsets, H) -> z and mu with H z + N' mu = pull, N z = offsets, for the rows `filled` of N.
 
-    The system's matrix is symmetric: the derivative of a solution is another solution for the same rows.
+    The system's matrix is symmetric. So a derivative of its solution solves the same system with another right-hand
+    side.
     """
 
     @staticmethod
@@ -235,7 +242,7 @@ class _InscribedBall(torch.autograd.Function):
 
     @staticmethod
     def _system(A: Tensor, centre: Tensor, radius: Tensor, rows: Tensor) -> tuple[Tensor, ...]:
-        """The rows (a, |a|), where the ball touches them, which are real ones, and their index."""
+        """The rows (a, |a|), the points where the ball touches them, a mask of real rows, and their indices."""
         real, rows = rows < A.shape[-2], rows.clamp(max=A.shape[-2] - 1)
         N, index = _taken(A, rows)
         N = torch.where(real.unsqueeze(-1), N, torch.as_tensor(simplex_around(A.shape[-1])[:, :-1], device=A.device))
@@ -281,7 +288,8 @@ def _finite(values: Tensor) -> Tensor:
 
 
 def _first_derivatives_suffice() -> bool:
-    """Then they can be compiled: no graph of them is asked for, and no transform (vmap, jvp) looks through them."""
+    """Are only first derivatives asked for, without a graph and without a transform (vmap, jvp)? Then compiled
+    vector-Jacobian products are used."""
     return not torch.is_grad_enabled() and not torch._C._are_functorch_transforms_active()
 
 
@@ -291,12 +299,12 @@ def _taken(A: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _of_rows(mu: Tensor, u: Tensor, v: Tensor, z: Tensor) -> Tensor:
-    """The derivative with respect to the active rows, from a solution (z, mu) and its adjoint (u, v)."""
+    """The gradient with respect to the active rows, given a solution (z, mu) and its adjoint (u, v)."""
     return -(mu.unsqueeze(-1) * u.unsqueeze(-2) + v.unsqueeze(-1) * z.unsqueeze(-2))
 
 
 def _definite(metric: Tensor | None, ok: Tensor) -> Tensor | None:
-    """The identity in place of a metric that is none."""
+    """The metric, replaced by the identity in items whose status is not OK."""
     if metric is None:
         return None
     return torch.where(ok.unsqueeze(-1), metric, torch.eye(metric.shape[-1], dtype=metric.dtype, device=metric.device))
@@ -307,7 +315,7 @@ def times(M: Tensor, v: Tensor) -> Tensor:
 
 
 def on_arrays(of: Callable[..., tuple], A: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
-    """A function of numpy arrays with one batch dimension, on tensors with any number; A is a batch of matrices."""
+    """Apply a function of numpy arrays with one batch dimension to tensors with any number. A is (*batch, m, p)."""
     batch, device = A.shape[:-2], A.device
     arrays = (
         t.detach().cpu().contiguous().numpy().reshape((batch.numel(), *t.shape[len(batch) :])) for t in (A, *others)
@@ -318,7 +326,7 @@ def on_arrays(of: Callable[..., tuple], A: Tensor, *others: Tensor) -> tuple[Ten
 
 
 def in_front(size: int, dims: tuple, inputs: tuple) -> list[Tensor | float | None]:
-    """What a vmap is given, with its dimension in front of every tensor."""
+    """The inputs of a vmap, with its dimension moved to the front of every tensor."""
     return [
         t if not isinstance(t, Tensor) else t.expand(size, *t.shape) if dim is None else t.movedim(dim, 0)
         for t, dim in zip(inputs, dims, strict=True)

@@ -1,6 +1,7 @@
-r"""The two programmes on numpy arrays (B, ...), with what their derivatives need: the face of the kernels.
+r"""The two programmes on numpy arrays (B, ...), with the active rows and multipliers that their derivatives need.
 
-An item whose answer the kernel could not verify is solved once more in rational arithmetic (`rational`).
+They are solved by the kernels. An item whose answer a kernel could not verify is solved again in rational arithmetic
+(`rational`).
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ def nearest_point(A: Reals, b: Reals, y: Reals, metric: Reals | None = None) -> 
         A: (B, m, p).
         b: (B, m).
         y: (B, p).
-        metric: (B, p, p), symmetric; None: the identity.
+        metric: (B, p, p), symmetric; None for the identity.
 
     Returns:
-        The point (B, p), the multipliers and the indices of its active rows (B, p), which of these places are filled
-        (the first ones), and a `ProgrammeStatus` (B,).
+        The point (B, p), the multipliers of its active rows (B, p), the indices of these rows (B, p), a mask of the
+        places that are filled, the first ones (B, p), and a `ProgrammeStatus` (B,).
     """
     B, _, p = A.shape
     z, mu, rows = np.zeros((B, p)), np.zeros((B, p)), np.zeros((B, p), dtype=np.int64)
@@ -49,8 +50,8 @@ def inscribed_ball(A: Reals, b: Reals) -> tuple:
         b: (B, m).
 
     Returns:
-        The centre (B, p), the radius (B,), the rows that decide them (B, p + 1), where m and above is none of the rows
-        (the set is open there), and a `ProgrammeStatus` (B,).
+        The centre (B, p), the radius (B,), the rows that decide them (B, p + 1), and a `ProgrammeStatus` (B,). An index
+        of m or more stands for no row: the set is open there.
     """
     B, _, p = A.shape
     centre, radius = np.zeros((B, p)), np.zeros(B)
@@ -62,7 +63,7 @@ def inscribed_ball(A: Reals, b: Reals) -> tuple:
 
 
 def solve_active(N: Reals, filled: Mask, pull: Reals, offsets: Reals, metric: Reals | None = None) -> tuple:
-    """z and mu with H z + N' mu = pull, N z = offsets, for the first rows of N, `filled`; mu = 0 for the others."""
+    """Solve H z + N' mu = pull, N z = offsets for z and mu, for the first rows of N, `filled`. Others get mu = 0."""
     z, mu = np.zeros_like(pull), np.zeros_like(offsets)
     implicit.solve_active(N, filled, pull, offsets, _or_identity(metric, N.shape[-1]), z, mu)
     return z, mu
@@ -71,7 +72,7 @@ def solve_active(N: Reals, filled: Mask, pull: Reals, offsets: Reals, metric: Re
 def nearest_point_vjp(
     A: Reals, rows: Indices, filled: Mask, mu: Reals, z: Reals, status: Indices, grad_z: Reals, grad_mu: Reals
 ) -> tuple:
-    """The gradients of A, b and y, from those of the nearest point (in the metric I) and of its multipliers."""
+    """The vector-Jacobian products (grad_A, grad_b, grad_y) of the nearest point in the metric I."""
     grad_A, grad_b, grad_y = np.zeros_like(A), np.zeros(A.shape[:2]), np.zeros_like(z)
     implicit.nearest_point_vjp(A, rows, filled, mu, z, status, grad_z, grad_mu, grad_A, grad_b, grad_y)
     return grad_A, grad_b, grad_y
@@ -80,7 +81,7 @@ def nearest_point_vjp(
 def inscribed_ball_vjp(
     A: Reals, centre: Reals, radius: Reals, rows: Indices, grad_centre: Reals, grad_radius: Reals
 ) -> tuple:
-    """The gradients of A and b, from those of the largest ball's centre and radius."""
+    """The vector-Jacobian products (grad_A, grad_b) of the largest ball's centre and radius."""
     grad_A, grad_b = np.zeros_like(A), np.zeros(A.shape[:2])
     simplex = simplex_around(A.shape[2])
     implicit.inscribed_ball_vjp(A, centre, radius, rows, simplex, grad_centre, grad_radius, grad_A, grad_b)
@@ -95,5 +96,5 @@ def simplex_around(p: int) -> Reals:
 
 
 def _or_identity(metric: Reals | None, p: int) -> Reals:
-    """The metric as the kernels take it: no matrices for the identity."""
+    """The metric in the form that the kernels take: an array (0, p, p) for the identity."""
     return np.empty((0, p, p)) if metric is None else metric

@@ -3,9 +3,10 @@ r"""Layers over half-spaces {z : A z <= b}: the Chebyshev centre, and the projec
     ChebyshevCentre    max r                        s.t.  a_j.z + |a_j| r <= b_j
     ProjectOnto        min 1/2 (z - y)' H (z - y)   s.t.  A z <= b
 
-Two backends give the same answers, with gradients. "exact" finds the active rows and solves them (`programmes`): any
-derivative, vmap, to round-off. "cvxpylayers" solves a conic programme with DIFFCP and SCS (`conic`): slower, first
-derivatives only; where the centre is not unique, it returns one of the centres, while exact states which.
+Two backends give the same answers, with gradients. "exact" finds the active rows and solves for them (`programmes`). It
+is accurate to round-off, has derivatives of any order, and works under vmap. "cvxpylayers" solves a conic programme
+with DIFFCP and SCS (`conic`). It is slower and has first derivatives only. Where the centre is not unique it returns
+any of the centres, while "exact" states which one.
 """
 
 from __future__ import annotations
@@ -26,11 +27,11 @@ Backend = Literal["exact", "cvxpylayers"]
 class ChebyshevCentre(nn.Module):
     """The centre and radius of a largest ball in each set, and a `ProgrammeStatus` per item: `layer(halfspaces)`.
 
-    See `programmes.inscribed_ball` for what is returned where the centre is not unique, and for sets that are empty.
+    `programmes.inscribed_ball` says what is returned for a centre that is not unique and for an empty set.
 
     Raises:
         InputError: there is no such backend.
-        SolverError: SCS gave up (cvxpylayers).
+        SolverError: the conic solver SCS failed (cvxpylayers).
     """
 
     def __init__(self, backend: Backend = "exact"):
@@ -52,12 +53,13 @@ class ProjectOnto(nn.Module):
     """The point of each set nearest to a given one, and a `ProgrammeStatus` per item: `layer(halfspaces, point)`.
 
     Attributes:
-        metric: symmetric positive definite, (p, p) or (*batch, p, p): the norm is sqrt(z' metric z), Mahalanobis if it
-            is an inverse covariance; None: Euclidean. A buffer, or a parameter if it comes as one.
+        metric: symmetric positive definite, (p, p) or (*batch, p, p). The norm is sqrt(z' metric z), the Mahalanobis
+            norm if the metric is an inverse covariance, and Euclidean for None. It is a buffer, or a parameter if it
+            is given as one.
 
     Raises:
-        InputError: there is no such backend; dimensions or batches do not fit; the metric is no batch of matrices.
-        SolverError: SCS gave up (cvxpylayers).
+        InputError: there is no such backend, dimensions or batches do not fit, or the metric is no batch of matrices.
+        SolverError: the conic solver SCS failed (cvxpylayers).
     """
 
     metric: Tensor | None

@@ -1,9 +1,9 @@
 r"""The two programmes in rational arithmetic, for the rare item whose floating-point answer could not be verified.
 
-The searches are those of `kernels.active_rows`, called as plain Python on `fractions.Fraction`: no pivot is lost in
-round-off then, and the searches are known to end. Only the violation of a row is still compared with round-off, that of
-the given numbers: a set is EMPTY only if it is so beyond round-off. What was found is rounded, and verified like any
-answer. It takes milliseconds, a thousand times as long as the kernel.
+The searches are those of `kernels.active_rows`, called as plain Python on `fractions.Fraction`. No pivot is lost in
+round-off, and the searches are known to end. Only the violation of a row is still compared with the round-off of the
+given numbers, so that a set is EMPTY only if it is so beyond round-off. The answer is rounded and verified like any
+other. An item takes milliseconds, a thousand times as long as with the kernel.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Array = NDArray[Any]
 
 
 def nearest_point(A: Array, b: Array, y: Array, H: Array, z: Array, mu: Array, rows: Array, filled: Array) -> int:
-    """Solve one item: fills the last four.
+    """Find the nearest point of one item. Fills `z`, `mu`, `rows` and `filled`.
 
     Returns:
         Its `ProgrammeStatus`.
@@ -33,7 +33,7 @@ def nearest_point(A: Array, b: Array, y: Array, H: Array, z: Array, mu: Array, r
     to_frame(A, b, y, L, metric, unit, offsets, sizes, lengths)
     real = np.flatnonzero(offsets < np.inf)
     N, o, noise = fractions(unit[real]), fractions(offsets[real]), fractions(sizes[real])
-    if not metric:  # the rows as they were given, up to powers of two
+    if not metric:  # the given rows, scaled by powers of two
         N, noise = fractions(A[real] * lengths[real, :1]), fractions(sizes[real] * lengths[real, 1])
         o = fractions(b[real] * lengths[real, 0]) - N @ fractions(y)
     scratch = [fractions(np.zeros(shape)) for shape in ((p, p), p, (p, p), (6, p))]
@@ -51,10 +51,10 @@ def nearest_point(A: Array, b: Array, y: Array, H: Array, z: Array, mu: Array, r
 
 
 def inscribed_ball(A: Array, b: Array, simplex: Array, centre: Array, rows: Array) -> tuple[float, int]:
-    """Solve one item: fills the last two.
+    """Find the largest ball of one item. Fills `centre` and `rows`.
 
     Returns:
-        The radius, and the `ProgrammeStatus`.
+        The radius and the `ProgrammeStatus`.
     """
     (m, p), n = A.shape, A.shape[1] + 1
     unit, offsets, sizes, lengths = np.ones((m, n)), np.empty(m), np.empty(m), np.empty((m, 2))
@@ -62,7 +62,7 @@ def inscribed_ball(A: Array, b: Array, simplex: Array, centre: Array, rows: Arra
     real = np.flatnonzero(offsets < np.inf)
     basis, able = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=bool)
     M, V, work = (fractions(np.zeros(shape)) for shape in ((n, n), (n, n), (5, n)))
-    # The rows as they were given, up to powers of two, and their lengths.
+    # The given rows, scaled by powers of two, and their lengths.
     N = np.column_stack([A[real] * lengths[real, :1], lengths[real, 1]])
     o, sides = fractions(b[real] * lengths[real, 0]), fractions(simplex)
     found = inscribed_rows(fractions(N), o, sides, 0, basis, M, V, work, able)

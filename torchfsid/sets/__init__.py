@@ -1,3 +1,3 @@
-"""Sets of parameters: batched polygons and polytopes, how they are cut, merged and differentiated, and the feasible set
-Theta(t) made of them.
+"""Sets of parameters: batched polygons and polytopes, and the feasible set Theta(t) that is made of them. The sets are
+cut, merged and differentiated here.
 """

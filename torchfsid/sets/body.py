@@ -1,4 +1,4 @@
-"""What every batch of sets answers, planar or not: a `Polygon` in the plane, a `Polytope` elsewhere."""
+"""The interface of a batch of sets: a `Polygon` in the plane, a `Polytope` in other dimensions."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ PRIOR = -1
 
 @dataclass(frozen=True)
 class Contradiction:
-    """Up to p + 1 rows per item that no point satisfies together (Helly), without gradients; NaN where there is none.
+    """Up to p + 1 rows per item that no point satisfies together (Helly), without gradients. Missing rows are NaN.
 
-    With some y >= 0, y'A = 0 and y'b < 0 by more than round-off.
+    The proof is a y >= 0 with y'A = 0 and y'b < 0 by more than round-off.
     """
 
     A: Float[Tensor, "B R p"]
@@ -38,10 +38,10 @@ class Clipped:
     """Bodies after a clip.
 
     Attributes:
-        body: the intersection; where it is empty, the body as it was.
+        body: the intersection. Empty items keep the body from before the clip.
         outcome: an `Outcome` per item.
-        shrunk: the item was really cut.
-        contradiction: for empty items, the rows that contradict each other.
+        shrunk: whether the clip made the item smaller.
+        contradiction: the rows that contradict each other, for empty items.
     """
 
     body: Any
@@ -54,9 +54,11 @@ class Body(Protocol):
     """A batch of bounded convex sets {z : A z <= b} in R^p, without redundant rows.
 
     Attributes:
-        A, b: the facets' rows, padded with 0.z <= 1.
-        count: how many of them are real.
-        time, source: when and from which constraint each facet came; NaN and `PRIOR` for those it began with.
+        A: the facets' rows, padded with 0.z <= 1.
+        b: their right-hand sides.
+        count: the number of real facets.
+        time: the time when each facet came [s]; NaN for the facets of the prior.
+        source: the constraint that each facet came from; `PRIOR` for the facets of the prior.
     """
 
     A: Float[Tensor, "B F p"]
@@ -67,7 +69,7 @@ class Body(Protocol):
 
     @property
     def reach(self) -> Float[Tensor, "B p"]:
-        """The largest |coordinates| that the sets ever had, for round-off is inherited."""
+        """The largest |coordinates| that the sets ever had. The round-off of the sets is proportional to them."""
         ...
 
     @property
@@ -76,7 +78,7 @@ class Body(Protocol):
         ...
 
     def rows(self) -> tuple[Float[Tensor, "B F p"], Float[Tensor, "B F"]]:
-        """A and b with the gradients of the rows that they are."""
+        """A and b, with the gradients of the given rows that have become facets."""
         ...
 
     def select(self, items: Int[Tensor, "k"]) -> Body:
@@ -84,7 +86,7 @@ class Body(Protocol):
         ...
 
     def replaced(self, items: Int[Tensor, "k"], other: Any) -> Body:
-        """This batch with `other` in the places `items`."""
+        """This batch with the sets of `other` at the places `items`."""
         ...
 
     def clip(
@@ -97,9 +99,9 @@ class Body(Protocol):
     ) -> Clipped:
         """Intersect every body with its R half-spaces A z <= b, stamping new facets with `time` and `source`.
 
-        A row that only touches a body within round-off is moved outward by that round-off and then applied. A body left
-        with more than `most` facets is merged outward; where that costs more than the cut has gained, it stays as it
-        was.
+        A row that only touches a body within round-off is moved outward by that round-off and then applied. A body
+        with more than `most` facets after the clip is merged outward. Where merging costs more than the cut has
+        gained, the body stays as it was.
         """
         ...
 
@@ -116,5 +118,5 @@ class Body(Protocol):
     def nearest(
         self, point: Float[Tensor, "B p"], metric: Float[Tensor, "B p p"] | None = None
     ) -> Float[Tensor, "B p"]:
-        """The point of each body nearest to `point`; `metric` is symmetric and positive definite."""
+        """The point of each body nearest to `point` in the norm sqrt(z' metric z); `metric` is positive definite."""
         ...

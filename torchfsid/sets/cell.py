@@ -1,19 +1,19 @@
-r"""One bounded convex polytope in R^p, in numpy: a cell, and how it is cut. Batches of cells are `polytope`.
+r"""One bounded convex polytope in R^p, in numpy: a cell, and how it is cut. `polytope` handles batches of cells.
 
-It is kept by facets and vertices together,
+A cell is stored by its facets and its vertices,
 
     facet f: A_f.z <= b_f,    vertex v: z_v,    incident[v, f]: vertex v lies on facet f.
 
-A half-space a.z <= c is intersected by one step of the double-description method. With s = a.z - c, the vertices beyond
-(s > 0) are dropped, and every edge from a vertex v to a vertex w beyond ends in the new vertex
+A cell is cut by a half-space a.z <= c in one step of the double-description method. Let s = a.z - c. The vertices
+beyond the half-space (s > 0) are dropped. Every edge from a vertex v inside to a vertex w beyond ends in the new vertex
 
     z_v + s_v / (s_v - s_w) (z_w - z_v);    an edge: v and w share p - 1 facets.
 
-No equation is ever solved, so that a vertex lies on its facets to round-off however thin the set is.
+No equation is solved. So a vertex lies on its facets to round-off, however thin the set is.
 
-Whatever round-off leaves open stays in: every set is an outer set. A row that would leave less than twice its round-off
-of the cell is moved outward until it leaves that much. So a cell always has an interior, and a set without one (a
-facet, an edge, a point) is a cell as thin as round-off.
+A point is removed only if it is outside beyond round-off: every set is an outer set. A row that would leave less than
+twice its round-off of the cell is moved outward until it leaves that much. So a cell always has an interior, and a set
+without one (a facet, an edge, a point) is a cell as thin as round-off.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ CANDIDATES = 4
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """A polytope, by facets (F) and vertices (V); `reach` (p,) is the largest |coordinate| that it ever had, for
-    round-off is inherited."""
+    """A polytope with F facets and V vertices. `reach` (p,) holds the largest |coordinates| that it ever had, to which
+    its round-off is proportional."""
 
     A: Reals
     b: Reals
@@ -53,7 +53,7 @@ class Cell:
 
     @classmethod
     def box(cls, lower: Reals, upper: Reals) -> Cell:
-        """Facets: the lower sides -z_i <= -lower_i, then the upper sides z_i <= upper_i."""
+        """The cell lower <= z <= upper. Its facets are the lower sides -z_i <= -lower_i, then the upper sides."""
         is_upper, unit = np.array(list(product([False, True], repeat=len(lower)))), np.eye(len(lower))
         return cls(
             A=np.vstack([-unit, unit]),
@@ -69,13 +69,13 @@ class Cell:
 
     @property
     def content(self) -> float:
-        """The volume; of a flat cell, a multiple of round-off."""
+        """The volume. That of a flat cell is a multiple of round-off."""
         count = np.array([len(self.vertices)])
         shape = Shape(self.A[None], self.b[None], self.vertices[None], count, self.incident[None], self.reach[None])
         return float(shape.content[0])
 
     def round_off(self, A: Reals, b: Reals) -> Reals:
-        """Round-off of A z - b over the cell."""
+        """A bound on the rounding error of A z - b over the cell."""
         return ROUND_OFF * (np.abs(A) @ self.reach + np.abs(b))
 
 
@@ -83,10 +83,10 @@ class Intersection(NamedTuple):
     """A cell intersected with rows.
 
     Attributes:
-        cell: what is left; where nothing is, the cell as it was.
-        origin: where each of its facets comes from: its place among the rows, then the facets that the cell had before.
-        outcome: see `Outcome`.
-        contradiction: if nothing is left, the rows and facets that contradict each other, by the same count.
+        cell: the intersection, or the cell from before if it is empty.
+        origin: the index of each facet among the rows followed by the facets that the cell had before.
+        outcome: an `Outcome`.
+        contradiction: the rows and facets that contradict each other if it is empty, by the same indices.
     """
 
     cell: Cell
@@ -104,13 +104,13 @@ class _Row(NamedTuple):
     tolerance: float
 
     def moved_outward(self) -> _Row:
-        """The row, if it leaves of the cell more than round-off; or moved until it leaves twice that."""
+        """The row if it leaves more than round-off of the cell. Otherwise it is moved until it leaves twice that."""
         step = self.over.min() + 2 * self.tolerance
         return self if step <= 0 else self._replace(c=self.c + step, over=self.over - step)
 
 
 def intersect(cell: Cell, A: Reals, b: Reals) -> Intersection:
-    """While a row cuts by more than round-off, cut by the one that cuts deepest; if nothing is left, say which rows."""
+    """Cut a cell by the rows A z <= b, the deepest first, as long as one cuts by more than round-off."""
     origin = len(A) + np.arange(len(cell.b))
     before, outcome, pending = (cell, origin), Outcome.NONEMPTY, np.ones(len(A), dtype=bool)
     while True:
@@ -135,7 +135,7 @@ def intersect(cell: Cell, A: Reals, b: Reals) -> Intersection:
 
 
 def _cut(cell: Cell, row: _Row) -> tuple[Cell, Mask]:
-    """The part of a cell inside a half-space that really cuts it, and which of its facets and the row are needed."""
+    """The part of a cell inside a half-space that cuts it, and a mask of the facets and the row that it needs."""
     p, on = len(row.a), cell.incident.astype(np.float32)
     inside, beyond = row.over < -row.tolerance, row.over > row.tolerance
     v, w = np.nonzero(on[inside] @ on[beyond].T >= p - 1)
@@ -147,8 +147,8 @@ def _cut(cell: Cell, row: _Row) -> tuple[Cell, Mask]:
     incident = np.concatenate([cell.incident[~beyond], cell.incident[v] & cell.incident[w]])
     incident = np.column_stack([incident, touching])
 
-    # Where many facets meet, a pair may share p - 1 of them without an edge: its crossing is inside a face. Likewise
-    # a facet may be left with no more than a side of another one.
+    # Where many facets meet, two vertices may share p - 1 of them without an edge. Their crossing is then inside a
+    # face. Likewise, what is left of a facet may be only a side of another one.
     extreme = ~touching
     extreme[touching] = _maximal(incident[touching])
     vertices, incident = vertices[extreme], incident[extreme]
@@ -159,7 +159,7 @@ def _cut(cell: Cell, row: _Row) -> tuple[Cell, Mask]:
 
 
 def _maximal(sets: Mask) -> Mask:
-    """Which sets (rows, by their members) are in no other one; of equal sets, the first."""
+    """A mask of the sets (rows that mark their members) that are in no other set. Of equal sets the first is kept."""
     members = sets.astype(np.float32)
     common = members @ members.T
     size = common.diagonal()
@@ -168,10 +168,10 @@ def _maximal(sets: Mask) -> Mask:
 
 
 def _contradiction(cell: Cell, row: _Row, origin: Indices) -> Indices:
-    """The row that every vertex exceeds and facets at the vertex nearest to it, y >= 0: a + sum y_f A_f = 0, by their
-    origin, the row's the last one.
+    """The origins of rows that contradict each other: facets at the vertex nearest to `row`, and last `row` itself.
 
-    Nothing if round-off leaves open whether they contradict each other.
+    Every vertex exceeds the row. The proof is a y >= 0 with a + sum y_f A_f = 0. The result is empty if round-off
+    leaves open whether they contradict each other.
     """
     at, frame = np.flatnonzero(cell.incident[row.over.argmin()]), cell.frame
     A, b = np.vstack([row.a, cell.A[at]]), np.append(row.c, cell.b[at])
@@ -179,20 +179,20 @@ def _contradiction(cell: Cell, row: _Row, origin: Indices) -> Indices:
     norms = lengths(rows)
     try:
         y, _ = nnls((rows[1:] / norms[1:, None]).T, -rows[0] / norms[0])
-    except RuntimeError:  # it stalled: undecided
+    except RuntimeError:  # the search stalled: undecided
         return NOTHING
     y = np.append(1.0, y) / norms
-    # For points z that satisfy the rows, and |z| <= reach as for all points of the set, y'b >= y'A z >= -|y'A| reach.
+    # Points z that satisfy the rows, with |z| <= reach as in the whole set, have y'b >= y'A z >= -|y'A| reach.
     if y @ b >= -(y @ cell.round_off(A, b) + np.abs(y @ A) @ cell.reach):
         return NOTHING
     return np.append(origin[-1], origin[at])[y > 0]
 
 
 def merged(cell: Cell, most: int) -> tuple[Cell, Indices]:
-    """An outer cell with at most `most` facets, and which facets it still has: dropped, one by one, is the facet whose
-    removal adds the least volume.
+    """An outer cell with at most `most` facets, and the indices of the facets that it keeps.
 
-    A facet that keeps the set bounded is never dropped, so that more than `most` may remain.
+    The facet whose removal adds the least volume is dropped, one by one. A facet without which the set would be
+    unbounded is never dropped. So more than `most` may remain.
     """
     origin = np.arange(len(cell.b))
     while len(cell.b) > most and (larger := _without_cheapest_facet(cell)) is not None:
@@ -202,8 +202,10 @@ def merged(cell: Cell, most: int) -> tuple[Cell, Indices]:
 
 
 def _without_cheapest_facet(cell: Cell) -> tuple[Cell, Indices] | None:
-    """The cell without the facet that keeps out the least volume, and which facets it still has; None if each of them
-    keeps it bounded."""
+    """The cell without the facet whose removal adds the least volume, and the indices of the facets that it keeps.
+
+    None if the cell would be unbounded without any one of them.
+    """
     (y,) = cell.frame.inside(cell.vertices[None])
     spreads = [y[on] - y[on].mean(0) for on in cell.incident.T]
     areas = [np.linalg.svd(spread, compute_uv=False)[: y.shape[1] - 1].prod() for spread in spreads]
@@ -221,7 +223,7 @@ def _without_cheapest_facet(cell: Cell) -> tuple[Cell, Indices] | None:
     others = np.arange(len(cell.b)) != cheapest
     A, b = cell.A[others], cell.b[others]
     rough = replace(_nearby(cell, A, b, REACH).cell, reach=cell.reach)
-    larger = _nearby(rough, A, b, 2.0)  # once more, with the round-off of its own size
+    larger = _nearby(rough, A, b, 2.0)  # again, with the round-off of its own size
     if least == inf or (larger.origin >= len(A)).any():
         return None
     reach = np.maximum(cell.reach, np.abs(larger.cell.vertices).max(0))
@@ -229,10 +231,10 @@ def _without_cheapest_facet(cell: Cell) -> tuple[Cell, Indices] | None:
 
 
 def _nearby(cell: Cell, A: Reals, b: Reals, times: float) -> Intersection:
-    """{z : A z <= b} in a box around a cell, `times` as large; from it come the facets of origin len(A) on."""
+    """{z : A z <= b} in a box around a cell, `times` as large. Facets of the box have origins from len(A) on."""
     frame = cell.frame
     middle, axes = frame.middle[0], frame.axes[0]
-    # Its sides are beyond those of the cell by more than their round-off, or the rows would not cut it.
+    # The sides of the box are beyond the cell by more than their round-off. Otherwise the rows would not cut it.
     half = np.abs((cell.vertices - middle) @ axes.T).max(0) * times + 16 * ROUND_OFF * cell.reach.sum()
     own = Cell.box(-half, half)
     vertices = middle + own.vertices @ axes

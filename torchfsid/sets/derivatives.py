@@ -1,18 +1,18 @@
-r"""How what is asked of a bounded convex polytope {z : A z <= b} changes with its rows, for any dimension p.
+r"""Derivatives of vertices, inscribed ball, volume and centroid of a bounded convex polytope {z : A z <= b} in R^p.
 
-Which facets meet in a vertex, fill the boundary or touch the inscribed ball is found without gradients. These are
-implicit equations of the answer, and give its derivatives of any order:
+The facets that meet in a vertex, fill the boundary or touch the inscribed ball are found without gradients. They give
+implicit equations for the answer, and implicit differentiation gives derivatives of any order:
 
     vertex            A_I z = b_I                  I: p of its facets
     inscribed ball    A_I z + |A_I| r = b_I        I: the p + 1 facets that decide it
 
-An answer is written as its number plus one Newton step of these equations; the step is zero, its derivatives are not.
-Volume V and centroid c change by what the facets sweep,
+An answer is written as its number plus one Newton step of these equations. The step is zero, its derivatives are not.
+Volume V and centroid c change by the volume that the facets sweep,
 
     dV = sum_f int_f (db_f - z.dA_f) dS / |A_f|,     dc = sum_f int_f (z - c) (db_f - z.dA_f) dS / (|A_f| V),
 
-integrals over the simplices that fill a facet. Their first derivatives do not depend on how a vertex is written, and
-are right also where more than p facets meet in one. The second ones are those of the vertices' equations.
+integrated over the simplices that fill a facet. First derivatives do not depend on the facets chosen for a vertex, and
+are right also where more than p facets meet in one. Second derivatives are those of the vertices' equations.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from torchfsid.halfspaces import dot
 
 
 class Skeleton(NamedTuple):
-    """What was found of a batch of polytopes, without gradients.
+    """The combinatorial structure of a batch of polytopes, without gradients.
 
     Attributes:
         corners: the vertices.
         bases: p facets of each vertex.
-        solved: are these independent, so that the vertex is their solution? Others do not depend on the rows.
-        simplices: the vertices of each simplex; together they fill the facets. Padding has all its vertices in one.
+        solved: whether these are independent, so that the vertex is their solution. Others are constant.
+        simplices: the vertices of each simplex. The simplices fill the facets. Padding repeats one vertex.
         facet: the facet that each simplex is a part of.
-        solid: is the volume more than round-off? The centroids of others do not depend on the rows.
+        solid: whether the volume is more than round-off. Otherwise the centroid is constant.
     """
 
     corners: Float[Tensor, "B V p"]
@@ -60,7 +60,7 @@ def inscribed_ball(
     rows: Int[Tensor, "B p+1"],
     solved: Bool[Tensor, "B"],
 ) -> tuple[Float[Tensor, "B p"], Float[Tensor, "B"]]:
-    """Centre and radius as functions of the p + 1 facets `rows` that decide them; constant unless they are `solved`."""
+    """Centre and radius as functions of the p + 1 facets `rows` that decide them. Constant where not `solved`."""
     N, ball = at(A, rows), torch.cat([centre, radius.unsqueeze(-1)], dim=-1)
     M = torch.cat([N, torch.linalg.vector_norm(N, dim=-1, keepdim=True)], dim=-1)
     ball = solution(ball, M, at(b, rows), solved)
@@ -79,7 +79,7 @@ def measure(
 
 
 class _Measure(torch.autograd.Function):
-    """(A, b, their numbers, what was found) -> volume and centroid."""
+    """(A, b, volume and centroid as numbers, skeleton) -> volume and centroid as functions of A and b."""
 
     @staticmethod
     def forward(
@@ -94,7 +94,7 @@ class _Measure(torch.autograd.Function):
     def backward(ctx: Any, grad_volume: Tensor, grad_centroid: Tensor) -> tuple[Tensor, Tensor, None, None, None]:
         A, b, volume, centroid = ctx.saved_tensors
         skeleton, p = ctx.skeleton, A.shape[-1]
-        # With gradients enabled, second derivatives are wanted.
+        # Second derivatives are wanted if gradients are enabled here.
         z = vertices(A, b, skeleton) if torch.is_grad_enabled() else skeleton.corners
         ends, normal = at(z, skeleton.simplices), at(A, skeleton.facet)
         area = _over_length(ends, normal)
@@ -114,7 +114,7 @@ class _Measure(torch.autograd.Function):
 
 
 def _over_length(ends: Float[Tensor, "B S p p"], normal: Float[Tensor, "B S p"]) -> Float[Tensor, "B S"]:
-    """The area of each simplex over the length of its facet's row: |det(edges, normal)| / ((p - 1)! |normal|^2)."""
+    """Each simplex's area divided by the length of its facet's row: |det(edges, normal)| / ((p - 1)! |normal|^2)."""
     p, squared = normal.shape[-1], dot(normal, normal)
     edges = ends[:, :, 1:] - ends[:, :, :1]
     if p == 2:
@@ -127,7 +127,7 @@ def _over_length(ends: Float[Tensor, "B S p p"], normal: Float[Tensor, "B S p"])
 def solution(
     number: Float[Tensor, "*N k"], M: Float[Tensor, "*N k k"], right: Float[Tensor, "*N k"], solved: Bool[Tensor, "*N"]
 ) -> Float[Tensor, "*N k"]:
-    """`number`, with the derivatives of the solution of M z = right that it is; constant where it is not `solved`."""
+    """`number` with the derivatives of the solution of M z = right, which it equals. Constant where not `solved`."""
     residual = torch.where(solved.unsqueeze(-1), right - dot(M, number.unsqueeze(-2)), 0.0)
     identity = torch.eye(M.shape[-1], dtype=M.dtype, device=M.device)
     M = torch.where(solved[..., None, None], M, identity)
@@ -141,7 +141,7 @@ def solution(
 
 
 def at(table: Tensor, index: Int[Tensor, "B *K"]) -> Tensor:
-    """The entries of table (B, F) or (B, F, p) at these places of each item."""
+    """The entries of `table` (B, F) or (B, F, p) at the places `index` of each item."""
     flat = index.flatten(1)
     if table.ndim == 2:
         return table.gather(1, flat).reshape(index.shape)

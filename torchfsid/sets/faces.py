@@ -1,12 +1,12 @@
-r"""The faces of polytopes, a batch at a time, from `incident` (B, V, F), which says on which facets each vertex lies.
+r"""The faces of a batch of polytopes, from `incident` (B, V, F), which says on which facets each vertex lies.
 
-A face is the set of its vertices; its sides are its intersections with facets. Seen from one of its vertices, its apex,
-a face is filled by the pyramids over the sides that the apex is not on, and so on down to the vertices:
+A face is given by the set of its vertices. Its sides are its intersections with facets. One of its vertices is its
+apex. The pyramids from the apex over the sides that do not contain it fill the face, and so on down to the vertices:
 
     vol_k(F) = sum over the sides S of F of dist(apex, S) vol_{k-1}(S) / k.
 
-Taken apart all the way, a facet is a set of simplices (Cohen and Hickey, J. ACM 26, 1979). Vertices that are on no
-facet are padding. Vertices are numbered through the batch, vertex v of item i being i V + v; likewise facets.
+This divides a facet into simplices (Cohen and Hickey, J. ACM 26, 1979). Vertices that are on no facet are padding.
+Vertices are numbered through the whole batch: vertex v of item i has the number i V + v. Likewise for facets.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ class Level(NamedTuple):
     """All faces of one dimension, and the pyramids that fill them.
 
     Attributes:
-        apex: of each face, its apex.
-        parent: of each pyramid, the face that it is a part of.
-        child: of each pyramid, its base, a face of the level below.
-        facet: of each pyramid, the facet that its base lies on.
+        apex: the apex of each face.
+        parent: the face that each pyramid is a part of.
+        child: the base of each pyramid, a face of the level below.
+        facet: the facet that the base of each pyramid lies on.
     """
 
     apex: Indices
@@ -70,7 +70,7 @@ def _pyramids(y: Reals, incident: Mask) -> tuple[Reals, Reals, Reals]:
         arms = share[:, None] * (centre[child] - y[apex[parent]])
         centre = y[apex] + np.stack([np.bincount(parent, arm, len(apex)) for arm in arms.T], axis=1)
         basis = np.concatenate([flat, (height / np.where(length > 0, length, 1.0)[:, None])[:, None]], axis=1)
-        rising = np.argsort(pyramid)  # of the pyramids over one face, the last one, the largest, gives its plane
+        rising = np.argsort(pyramid)  # the last and largest of the pyramids over a face gives its plane
         plane = np.zeros((len(apex), k, p))
         plane[parent[rising]] = basis[rising]
         base = apex
@@ -78,7 +78,7 @@ def _pyramids(y: Reals, incident: Mask) -> tuple[Reals, Reals, Reals]:
 
 
 def simplices(incident: Mask, p: int) -> tuple[Indices, Indices]:
-    """The facets, taken apart: the vertices (S, p) of each simplex, and the facet (S,) that it is a part of."""
+    """The facets divided into simplices: the vertices (S, p) of each, and the facet (S,) that it is a part of."""
     (_, V, F), found = incident.shape, []
     for some in _parts(incident, p):
         corners, facet = _simplices(incident[some], p)
@@ -104,10 +104,11 @@ def _simplices(incident: Mask, p: int) -> tuple[Indices, Indices]:
 
 
 def bases(rows: Reals, incident: Mask) -> tuple[Indices, Mask]:
-    """For each vertex p of its facets (B, V, p) that it is the solution of, and whether there are so many (B, V).
+    """For each vertex, p independent facets that meet in it (B, V, p), and whether there are p of them (B, V).
 
-    `rows` (B, F, p) are the facets' normals, of length 1 or 0. Where more than p facets meet, the one that is furthest
-    from the span of those taken already is taken next; one within `PARALLEL_ROWS` [rad] of it is none.
+    `rows` (B, F, p) are the facets' normals, of length 1 or 0. Where more than p facets meet, the facet whose normal is
+    furthest from the span of those already taken is taken next. A facet within `PARALLEL_ROWS` [rad] of it is not
+    taken.
     """
     (B, V, _), p = incident.shape, rows.shape[2]
     chosen, enough = np.zeros((B, V, p), dtype=np.int64), np.ones((B, V), dtype=bool)
@@ -124,14 +125,14 @@ def bases(rows: Reals, incident: Mask) -> tuple[Indices, Mask]:
 
 
 def _parts(incident: Mask, p: int) -> list[slice]:
-    """The batch in parts, so that no table becomes larger than about `TABLE`; a face has about p sides."""
+    """Slices of the batch, so that no table becomes larger than about `TABLE`. A face is assumed to have p sides."""
     B, V, F = incident.shape
     size = max(1, TABLE // (p * V * F * F))
     return [slice(first, min(B, first + size)) for first in range(0, B, size)]
 
 
 def _descent(incident: Mask, p: int) -> tuple[list[Level], Indices]:
-    """From the polytopes down to their edges, level by level; below them the vertices."""
+    """The levels of faces from the polytopes down to their edges, and the vertices below the edges."""
     B, V, F = incident.shape
     on, owner = incident.astype(np.float32), np.arange(B)
     faces: Mask = np.asarray(incident.any(2))
@@ -139,12 +140,12 @@ def _descent(incident: Mask, p: int) -> tuple[list[Level], Indices]:
     for k in range(p, 0, -1):
         apex = faces.argmax(1)
         is_side = (faces.astype(np.float32)[:, None] @ on[owner])[:, 0] >= k
-        if k < p:  # at the top, the sides at the apex are only wanted for their areas
+        if k < p:  # at the top, sides that contain the apex are needed only for their areas
             is_side &= ~incident[owner, apex]
         parent, facet = np.nonzero(is_side)
         item = owner[parent]
         sides = faces[parent] & incident[item, :, facet]
-        # Sorted as strings of bytes: faster than as rows.
+        # Sorting strings of bytes is faster than sorting rows.
         keys = np.column_stack([item.astype(">u4").view(np.uint8).reshape(-1, 4), np.packbits(sides, axis=1)])
         keys = np.ascontiguousarray(keys)
         _, first, child = np.unique(keys.view(f"S{keys.shape[1]}")[:, 0], return_index=True, return_inverse=True)
