@@ -178,8 +178,7 @@ class Measurement:
             nobody = [part.x.new_tensor([[torch.inf], [0.0], [0.0]]).expand(3, len(part.x)) for part in parts]
             columns = zip(*(p.left_out or none.unbind() for p, none in zip(parts, nobody, strict=True)), strict=True)
             left_out = LeftOut(*map(torch.cat, columns))
-        return cls(t=torch.cat(times), left_out=left_out, **{name: joined(name) for name in names})  # type:
-        ignore[arg-type]
+        return cls(t=torch.cat(times), left_out=left_out, **{name: joined(name) for name in names})  # type: ignore[arg-type]
 
     def observed_only(self) -> Measurement:
         """With zeros for the positions and controls of robots that were not observed, whatever stood there.
