@@ -59,7 +59,7 @@ class Polytope:
 
     @classmethod
     def from_box(cls, lower: Float[Tensor, "B p"], upper: Float[Tensor, "B p"]) -> Polytope:
-        """Axis-parallel boxes. Facets are first the lower sides -z_i <= -lower_i, then the upper ones z_i <= upper_i."""
+        """Axis-parallel boxes. Facets: first the lower sides -z_i <= -lower_i, then the upper sides z_i <= upper_i."""
         B, p = lower.shape
         unit, b = torch.eye(p, dtype=lower.dtype, device=lower.device), torch.cat([-lower, upper], dim=-1)
         A, nothing = torch.cat([-unit, unit]).expand(B, 2 * p, p), torch.full_like(b, nan)
