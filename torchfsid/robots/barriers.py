@@ -90,8 +90,9 @@ def controller_failed(
 ) -> Bool[Tensor, "*batch"]:
     """May the controller of a robot have found no solution? Then it commands exactly zero, which says nothing of theta.
 
-    A robot's own QP has failed if its control is zero and zero violates one of its `rows`, up to their `errors`. A
-    joint QP that fails stops the whole team. So it may have failed whenever no robot moves.
+    A robot's own QP has failed if its control is zero and zero violates one of its `rows`. It may have failed if zero
+    violates a row that is wrong by at most its `errors`. A joint QP that fails stops the whole team. So it may have
+    failed whenever no body moves.
     """
     assert measurement.u is not None
     stopped = (measurement.u == 0).all(-1)
