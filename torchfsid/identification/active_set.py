@@ -1,6 +1,6 @@
 """Which rows a measured control touches (G., Eqs. (11), (12), (17)).
 
-slack   s_j = (b_j - a_j.u)/|a_j|   [m/s], the distance of u to row j: it does not depend on the row's scale
+slack   s_j = (b_j - a_j.u)/|a_j|   [m/s], the distance of u to the boundary of row j, for any scale of the row
 active  |s_j| < tolerance
 """
 

@@ -3,9 +3,9 @@ r"""The paper's instantaneous feasible set Omega: every theta whose QP has the o
     inactive rows:  A_in (G theta + f) <= b_in                   (the paper's strict < is closed, here and only here)
     multipliers:    C theta + d - (G theta + f)  in  cone{a_j : j active}
 
-One formula for cases A-E (G., Eqs. (19), (29), (44), (47), (54)): the "floating" eta of cases C and E, which is
-quantified by "if there exists eta", is exactly membership in this cone. It does not use the measured control, only
-which rows are active, and equals the critical region of multiparametric quadratic programming.
+One formula covers cases A-E (G., Eqs. (19), (29), (44), (47), (54)). The "floating" eta of cases C and E, quantified by
+"if there exists eta", is exactly membership in this cone. The set depends on the active rows only, not on the measured
+control. It equals the critical region of multiparametric quadratic programming.
 """
 
 from __future__ import annotations
@@ -27,8 +27,11 @@ def critical_region(
 ) -> Halfspaces:
     """Omega as half-spaces of theta: rows 0..m-1 keep row j inactive, the last 4 keep the multipliers non-negative.
 
-    Rows that say nothing are padding. `source` is j where row j must stay inactive and m + j where its multiplier must
-    not be negative. Controls are planar (n = 2); p is any.
+    Rows that do not restrict theta are padding. `source` is j where row j must stay inactive, and m + j where its
+    multiplier must not be negative. Controls are planar (n = 2), p is any.
+
+    Raises:
+        InputError: shapes do not fit, or controls are not planar.
     """
     C, d = C.to(torch.float64), d.to(torch.float64)
     return region_of(safe_controls.normalised(), solve_kkt(safe_controls, active, C, d), C, d)
@@ -37,11 +40,12 @@ def critical_region(
 def region_of(
     unit: Halfspaces, kkt: KktSolution, C: Float[Tensor, "*batch n p"], d: Float[Tensor, "*batch n"]
 ) -> Halfspaces:
-    """`critical_region` of unit rows whose KKT conditions are solved."""
-    # A row inside the span of the active rows cannot see theta: u* does not move along it.
+    """`critical_region` for unit rows whose KKT conditions are solved already."""
+    # A row in the span of the active rows does not restrict theta: u* does not move along it.
     across = unit.A.detach() @ kkt.free.detach()
     sees_theta = dot(across, across) > RANK_TOLERANCE**2
-    # C theta + d - u* = P (C theta + d - A_a^+ b_a) lies in the span of the active rows: normals across it say nothing.
+    # C theta + d - u* = P (C theta + d - A_a^+ b_a) lies in the span of the active rows: normals across it do not
+    # matter.
     normals, generator = outward_normals(unit.A, kkt.active, CRITICAL_NORMALS)
     along = normals @ kkt.projector
     j = torch.arange(unit.rows, device=generator.device).expand(kkt.active.shape)

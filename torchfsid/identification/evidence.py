@@ -1,16 +1,17 @@
-r"""What one measurement says about theta: from positions and a control to half-spaces, for B robots at once.
+r"""Evidence: the half-spaces of theta that follow from one measurement of positions and controls, for B robots at once.
 
     rows A u <= b, task (C, d), control u  ->  slacks  ->  active rows  ->  KKT conditions  ->  half-spaces of theta
 
-A sample says something only if
+A sample is informative only if
     - the robot was observed, and its controller had a solution (`controller_failed`);
-    - the model could be evaluated: no row, and nothing of the task, is NaN or infinite;
+    - the model could be evaluated: no row, C or d is NaN or infinite;
     - the rows of bodies without a slot are provably inactive (`neighbours`);
-    - no hard row is violated by more than its bound: otherwise model or bounds are wrong, and the sample is alarming;
-    - no row that may be active may point anywhere (a body at the robot's own place, within the errors of positions).
+    - no hard row is violated by more than its bound. Otherwise model or bounds are wrong, and the sample is alarming;
+    - every row that may be active has a known direction. It has none if a body is at the robot's own place, within the
+      errors of positions.
 
-The measurements of a whole log, concatenated, are one batch. In the plane, where no gradient is needed, compiled code
-does the same from the slacks on (`kernels.evidence`).
+The measurements of a whole log can be concatenated into one batch. In the plane, where no gradient is needed, compiled
+code computes the same from the slacks on (`kernels.evidence`).
 """
 
 from __future__ import annotations
@@ -44,13 +45,15 @@ SetKind = Literal["critical_region", "inverse_optimal"]
 
 @dataclass(frozen=True)
 class ObservationModel:
-    """What is declared about the robots, and how their motions are read.
+    """The declared model of the robots, and the kind of half-spaces that follow from their motions.
 
     Attributes:
-        task, barriers: what the robots do.
-        kind: `critical_region` (the paper's Omega: for exact data of exact controllers) or `inverse_optimal`.
-        noise: bounds for `inverse_optimal` and for the alarm.
-        active_tolerance: when a row counts as active for `critical_region`, for the case label and for (G, f) [m/s].
+        task: the task of all robots.
+        barriers: the barriers of all robots.
+        kind: `critical_region` (the paper's Omega, for exact data of exact controllers) or `inverse_optimal`.
+        noise: bounds on errors, for `inverse_optimal` and for the alarm.
+        active_tolerance: the slack below which a row counts as active for `critical_region`, the case label and
+            (G, f) [m/s].
 
     Raises:
         InputError: `inverse_optimal` comes without `noise`, `critical_region` with a clipped nominal control, or
@@ -77,14 +80,14 @@ class Evidence:
     """What one measurement says by itself.
 
     Attributes:
-        omega: half-spaces of theta; padding where the sample is not used. See `critical_region` and
-            `inverse_optimal_set` for their sources.
-        informative: the sample is used.
-        alarmed: it is not, because a hard row is violated beyond its bound.
-        slack: of the measured control to every row [m/s].
-        excess: violation of every row beyond its bound, positive if there is any [m/s].
+        omega: half-spaces of theta, all padding where the sample is not used. Their sources are those of
+            `critical_region` or `inverse_optimal_set`.
+        informative: whether the sample is used.
+        alarmed: whether it is not used because a hard row is violated beyond its bound.
+        slack: the slack of every row at the measured control [m/s].
+        excess: the violation of every row beyond its bound [m/s]; positive if it is violated.
         hard: the rows that no controller may violate.
-        solve: solves the KKT conditions; ask for `kkt`.
+        solve: solves the KKT conditions. Use `kkt` instead.
     """
 
     omega: Halfspaces
@@ -97,22 +100,26 @@ class Evidence:
 
     @cached_property
     def kkt(self) -> KktSolution:
-        """u* = G theta + f at the observed active set; solved once, when somebody asks."""
+        """The control u* = G theta + f at the observed active set. It is solved once, on first use."""
         return self.solve()
 
 
 @dataclass(frozen=True)
 class _Sample:
-    """The model at one measurement; NaN and infinite where it could not be evaluated.
+    """The model at one measurement. Its numbers are NaN or infinite where it could not be evaluated.
 
     Attributes:
-        rows: A u <= b. hard: those that no controller may violate.
-        u: the measured control [m/s]. C, d: the nominal control C theta + d.
-        usable: what may say something, as far as that is known before the rows are looked at.
-        bound: the slack with which an active row may be measured [m/s], broadcasting with (B, m).
-        ball, drift: errors of u and of C theta + d [m/s], broadcasting with (B,).
-        row_errors: of the rows; None: they are exact.
-        corners: of Theta; None: nobody needs them.
+        rows: the rows A u <= b.
+        hard: the rows that no controller may violate.
+        u: the measured control [m/s].
+        C: of the nominal control C theta + d.
+        d: of the nominal control C theta + d [m/s].
+        usable: whether the sample may be informative, before the rows are tested.
+        bound: the largest slack of an active row [m/s], broadcasting with (B, m).
+        ball: a bound on the error of u [m/s], broadcasting with (B,).
+        drift: a bound on the error of C theta + d [m/s], broadcasting with (B,).
+        row_errors: bounds on the errors of the rows; None if they are exact.
+        corners: the vertices of Theta; None if they are not needed.
     """
 
     rows: Halfspaces
@@ -134,16 +141,16 @@ def evidence(
     """What a measurement says about theta.
 
     Args:
-        model: what is declared.
-        theta: what is known of the robots so far, batch (B,). Only clipped nominal controls, and position errors of
-            tasks with an unknown gain, look at it.
-        measurement: of these robots, or several such measurements concatenated.
-        compiled: run compiled code, or the same in torch; None: compiled wherever it can, that is where controls and
-            theta are planar, nothing is clipped, no gradient is needed and tensors are on the CPU.
+        model: the declared model.
+        theta: the robots' sets so far, batch (B,). They are used only for clipped nominal controls, and for position
+            errors of tasks with an unknown gain.
+        measurement: a measurement of these robots, or several concatenated.
+        compiled: whether to run compiled code instead of torch. None chooses compiled code wherever it is possible:
+            controls and theta are planar, nothing is clipped, no gradient is needed, and tensors are on the CPU.
 
     Raises:
-        InputError: the measurement has no velocities, or they are not finite where the robot was observed; it does not
-            fit theta; or `compiled` is True and cannot be.
+        InputError: the measurement has no velocities, they are not finite for an observed robot, the measurement does
+            not fit theta, or `compiled` is True where it is not possible.
     """
     sample = _sample(model, theta, measurement.observed_only())
     if _can_be_compiled(model, sample, compiled):

@@ -2,18 +2,18 @@ r"""The inverse-optimal set: every theta for which the measured control is optim
 
     { theta : C theta + d - u  in  cone{a_j : s_j <= slack} (+) ball(velocity) }
 
-If |u - u*| <= `velocity` and the slack of every truly active row is measured below `slack`, the truth is inside: its
-C theta + d - u* is in the cone of its active rows (KKT), these are among the generators, and exchanging u* for u moves
-the vector by at most `velocity`. The slack test is one-sided, so violated (soft) rows count as active. Each outward
-normal n of the cone gives one half-space n.(C theta + d - u) <= velocity; the corners of the sum are rounded off by a
-fan of normals, an outer polygon. An intersection over time never forgives one wrong step: unlike the critical region,
-this set is not wrong when a solver is inexact or a row is nearly active.
+The truth is inside if |u - u*| <= `velocity` and the slack of every truly active row is measured below `slack`. By KKT,
+its C theta + d - u* lies in the cone of its active rows, which are among the generators. Replacing u* by u moves this
+vector by at most `velocity`. The slack test is one-sided, so violated (soft) rows count as active. Each outward normal
+n of the cone gives one half-space n.(C theta + d - u) <= velocity. A fan of normals rounds off the corners of the sum
+by an outer polygon. An intersection over time never recovers from one wrong set. Unlike the critical region, this set
+stays right if a solver is inexact or a row is nearly active.
 
-Positions that are known up to a bound turn the rows, move their boundaries and shift C theta + d: the generators become
-fans and the slack test grows (`RowErrors`), and so does the ball, by the drift of C theta + d. A row of which no
-direction is known, and which may be active, is a generator in all directions: nothing is said then. Only a zero row
-without such an error is padding. A clipped nominal control opens the set in the directions of saturation
-(`saturation`). Each widening is an outer one. (Not in the paper; proofs in docs/theory.md.)
+Errors of positions turn the rows, move their boundaries and shift C theta + d. So generators become fans, the slack
+test widens (`RowErrors`), and the ball grows by the drift of C theta + d. A row of unknown direction that may be active
+is a generator in all directions, and the set is the whole space. Only a zero row without such an error is padding. A
+clipped nominal control opens the set in the directions of saturation (`saturation`). Each widening gives an outer set.
+This set is not in the paper; docs/theory.md has the proofs.
 """
 
 from __future__ import annotations
@@ -45,19 +45,20 @@ def inverse_optimal_set(
     saturation: Saturation | None = None,
     possible: Float[Tensor, "*batch v n"] | None = None,
 ) -> Halfspaces:
-    """The set as half-spaces of theta, unneeded rows padded. Controls are planar (n = 2); p is any.
+    """The set as half-spaces of theta, with unneeded rows as padding. Controls are planar (n = 2), p is any.
 
-    `source` is m + j where a half-space comes from the multiplier of row j, 2 m where no single row is to blame.
+    `source` is m + j where a half-space comes from the multiplier of row j, and 2 m where it comes from no single row.
 
     Args:
         safe_controls: the rows A u <= b.
         u: the measured control [m/s].
-        C, d: the nominal control C theta + d.
-        noise: `velocity` and `slack` of it; its bounds on positions and neighbours come in as the next two.
-        row_errors: how far the rows may be off; None: they are exact.
-        drift: how far C theta + d may be off [m/s].
-        saturation: the nominal control is clipped.
-        possible: points whose convex hull holds every C theta + d that is still possible [m/s], required with a
+        C: of the nominal control C theta + d.
+        d: of the nominal control C theta + d [m/s].
+        noise: `velocity` and `slack` are used. Errors of positions and neighbours are given by `row_errors` and
+        `drift`. row_errors: bounds on the errors of the rows; None if they are exact.
+        drift: a bound on the error of C theta + d [m/s].
+        saturation: how the nominal control is clipped; None if it is not.
+        possible: points whose convex hull holds every C theta + d that is still possible [m/s]. Required with a
             saturation.
 
     Raises:
@@ -83,7 +84,7 @@ def set_around(
     saturation: Saturation | None,
     possible: Float[Tensor, "*batch v n"] | None,
 ) -> Halfspaces:
-    """`inverse_optimal_set` of unit rows, those `near` the control being the ones that may be active."""
+    """`inverse_optimal_set` for unit rows, of which those marked by `near` may be active."""
     m, generators = unit.rows, unit.A
     if row_errors is None:
         may_be_active = near & (generators != 0).any(-1)
@@ -111,12 +112,12 @@ def set_around(
 
 
 def without_direction(unit: Halfspaces, row_errors: RowErrors) -> Bool[Tensor, "*batch m"]:
-    """Rows that may point anywhere: turned by up to pi, or vanished where errors could have turned them."""
+    """A mask of rows of unknown direction: turned by up to pi, or zero where errors could have turned them."""
     return (row_errors.angle >= math.pi) | ((row_errors.angle > 0) & (unit.A == 0).all(-1))
 
 
 def per_row(bound: float | Float[Tensor, "*batch"], like: Tensor) -> Float[Tensor, "*batch 1"]:
-    """A bound of `NoiseBound` as a tensor that goes with the rows of a batch."""
+    """A bound of `NoiseBound` as a tensor that broadcasts with the rows of a batch."""
     return torch.as_tensor(bound, dtype=like.dtype, device=like.device).unsqueeze(-1)
 
 

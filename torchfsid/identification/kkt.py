@@ -12,14 +12,14 @@ singular value: the columns of A_a W are orthonormal up to round-off, S = (A_a W
 
     A_a^+ b_a = W S^-1 (A_a W)' b_a,     S^-1 = I - E + E^2          (the first and second derivatives are exact, too)
 
-which keeps the digits that the Gram matrix of nearly parallel rows loses. At rank 2 it holds for any W, so W is found
-without gradients, and orthogonal equal rows, where the derivative of an SVD does not exist, are nothing special. At
-rank 1, W is the rows' direction.
+This keeps the digits that the Gram matrix of nearly parallel rows loses. At rank 2 it holds for any W, so W is found
+without gradients. So orthogonal rows of equal length, where the derivative of an SVD does not exist, need no special
+treatment. At rank 1, W is the rows' direction.
 
-The multipliers exist exactly where  C theta + d - u*(theta)  lies in  cone{a_j : j active}. In the plane this cone
-is written by outward normals: sort the generators by angle; an angular gap of at least 180 degrees is the polar cone's
-opening, from one end + 90 degrees to the other - 90; without such a gap the cone is the whole plane.
-The letters A-E are names for (K, rank), computed for tables and nothing else.
+The multipliers exist exactly where  C theta + d - u*(theta)  lies in  cone{a_j : j active}. In the plane this cone is
+described by outward normals. The generators are sorted by angle. If there is an angular gap of at least 180 degrees,
+the polar cone opens in it, from one end + 90 degrees to the other - 90. Otherwise the cone is the whole plane.
+The letters A-E are names for (K, rank). They are computed for tables only.
 """
 
 from __future__ import annotations
@@ -45,11 +45,15 @@ class KktSolution:
     """The control as a function of the parameter while the active set stays as it is.
 
     Attributes:
-        G, f: u*(theta) = G theta + f.
-        projector: P = A_a^+ A_a, onto the span of the active rows. free: I - P, exactly zero at full rank.
+        G: of u*(theta) = G theta + f.
+        f: of u*(theta) = G theta + f [m/s].
+        projector: P = A_a^+ A_a, onto the span of the active rows.
+        free: I - P, exactly zero at full rank.
         offset: A_a^+ b_a, the part of u* that the active rows decide [m/s].
-        active: the active rows. n_active: K, their number. rank: of A_a.
-        case: index into `CASES`.
+        active: the active rows.
+        n_active: K, the number of active rows.
+        rank: the rank of A_a.
+        case: the index of the case in `CASES`.
     """
 
     G: Float[Tensor, "*batch n p"]
@@ -88,13 +92,13 @@ def solve_unit(
     C: Float[Tensor, "*batch n p"],
     d: Float[Tensor, "*batch n"],
 ) -> KktSolution:
-    """`solve_kkt` of unit rows."""
+    """`solve_kkt` for unit rows."""
     n, p = unit.dim, C.shape[-1]
     A, b = unit.A.masked_fill(~active.unsqueeze(-1), 0.0), unit.b.masked_fill(~active, 0.0)
 
     offset, projector, rank = _solve_planar(A, b) if n == 2 else _solve(A, b)
     identity = torch.eye(n, dtype=A.dtype, device=A.device)
-    # At full rank nothing of theta gets through: exactly nothing, not a rounding error of I - P.
+    # At full rank u* does not depend on theta. G is then exactly zero, not a rounding error of I - P.
     free = (identity - projector).masked_fill((rank == n)[..., None, None], 0.0)
     through = free @ torch.cat([C, d.unsqueeze(-1)], dim=-1)
 
@@ -124,7 +128,7 @@ def _solve_planar(A: Float[Tensor, "*batch m 2"], b: Float[Tensor, "*batch m"]) 
     """A^+ b, A^+ A and the rank; the rows are unit rows or zero."""
     y, size, across, rank = _principal_axes(A.detach())
     full = (rank == 2)[..., None, None]
-    # Rank 1: the rows' direction, by a step of the power iteration from where it has converged, which has its gradient.
+    # Rank 1: the rows' direction. One step of the converged power iteration gives it with its gradient.
     direction = (A.mT @ y.unsqueeze(-1)).squeeze(-1)
     length = dot(direction, direction).masked_fill(rank == 0, 1.0).sqrt()
     direction = direction / length.unsqueeze(-1)
@@ -143,8 +147,12 @@ def _solve_planar(A: Float[Tensor, "*batch m 2"], b: Float[Tensor, "*batch m"]) 
 
 @torch.no_grad()
 def _principal_axes(A: Float[Tensor, "*batch m 2"]) -> tuple[Tensor, Tensor, Tensor, Int[Tensor, "*batch"]]:
-    """Of rows A: y = A v_1 with v_1 the first principal axis; the first singular value |y| (1: no row); the second
-    axis over its singular value (zero at a lower rank); and the rank."""
+    """The principal axes of rows A.
+
+    Returns:
+        y = A v_1 with v_1 the first axis, the first singular value |y| (1 without rows), the second axis divided by
+        its singular value (zero at a lower rank), and the rank.
+    """
     first, second = A.unbind(-1)
     turn = torch.atan2(2 * (first * second).sum(-1), ((first + second) * (first - second)).sum(-1)) / 2
     cos, sin = turn.cos().unsqueeze(-1), turn.sin().unsqueeze(-1)
@@ -160,7 +168,7 @@ def _principal_axes(A: Float[Tensor, "*batch m 2"]) -> tuple[Tensor, Tensor, Ten
 
 
 class OutwardNormals(NamedTuple):
-    """Unit outward normals of a cone (zero: not needed), and for each the generator it is nearest to (m: none)."""
+    """Unit outward normals of a cone, zero where not needed, and the generator nearest to each (m for none)."""
 
     normals: Float[Tensor, "*batch k 2"]
     generator: Int[Tensor, "*batch k"]
@@ -171,9 +179,9 @@ def outward_normals(
 ) -> OutwardNormals:
     """Outward normals of cone{a_j : j present} in the plane: w is in the cone iff n.w <= 0 for all of them.
 
-    Up to `fan` normals are spread evenly over the polar cone, both ends included (the ends alone describe a pointed
-    cone; a ray needs its cap too; a widened cone is rounded off by more of them), and one more serves a line. No
-    generator: the cone is the origin and the fan goes all around. k = fan + 1.
+    Up to `fan` normals are spread evenly over the polar cone, both ends included. The two ends suffice for a pointed
+    cone. A ray needs a cap as well. More normals round off the corners of a widened cone. One additional normal is for
+    a line, so k = fan + 1. Without generators the cone is the origin, and the fan is a full turn.
 
     Raises:
         InputError: the generators are not planar, or `fan` < 3.
@@ -183,12 +191,12 @@ def outward_normals(
     if fan < 3:
         raise InputError("fan", "at least 3 normals (two ends and a cap)", fan)
     m, shape = generators.shape[-2], present.shape[:-1]
-    if m == 0:  # one that is never there
+    if m == 0:  # a generator that is never present
         generators, present = generators.new_zeros(*shape, 1, 2), present.new_zeros(*shape, 1)
     generators = generators.expand(*shape, max(m, 1), 2)
     gaps = _gaps(generators.detach(), present)
 
-    # The rows at the ends of the gaps were found without gradients; the normals are theirs, with gradients.
+    # The rows at the ends of the gaps were found without gradients. Their normals are computed with gradients.
     ends = generators.gather(-2, gaps.ends.unsqueeze(-1).expand(*shape, 3, 2))
     none = ~gaps.some
     ends = ends.masked_fill(none.unsqueeze(-1), 1.0)
@@ -211,9 +219,11 @@ class _Gaps(NamedTuple):
 
     Attributes:
         ends: the generators where the widest gap begins and ends, and the one where the second begins.
-        turns: 2 pi where the widest gap spans the angle pi, at which angles begin anew.
-        some: there are generators. is_open: the widest gap is 180 degrees or more. is_wide: it is more.
-        is_line: both gaps are 180 degrees.
+        turns: 2 pi where the widest gap contains the angle pi, at which angles wrap; 0 elsewhere.
+        some: whether there are generators.
+        is_open: whether the widest gap is at least 180 degrees.
+        is_wide: whether the widest gap is more than 180 degrees.
+        is_line: whether both gaps are 180 degrees.
     """
 
     ends: Int[Tensor, "*batch 3"]

@@ -1,20 +1,20 @@
-r"""What a saturated nominal control says about the wish behind it.
+r"""Half-spaces of the unclipped nominal control y, given half-spaces of the clipped one.
 
     uhat = clip(y),   y = C theta + d          clipped by norm, |uhat| <= v, or by axis, |uhat_i| <= v_i; zero in a dead
     zone
 
-To treat a clipped control as linear loses the truth. Let Q be the set in which uhat must lie (the measured control,
-plus the cone of the rows that may be active, plus the bounds), and P = Q within the limit. Where uhat is inside the
-limit y = uhat; where it is on the limit y lies further out, in a direction of saturation. The closed convex hull of
-these y is
+Treating a clipped control as linear may lose the truth. Let Q be the set in which uhat must lie (the measured control,
+plus the cone of the rows that may be active, plus the bounds), and P the part of Q within the limit. If uhat is inside
+the limit, y = uhat. If uhat is on the limit, y lies further out, in a direction of saturation. The closed convex hull
+of these y is
 
     P (+) Cn,      Cn = the cone of the directions in which P touches the limit,
 
 that is n.y <= h_P(n), h_P the support function, for the normals n in the polar cone of Cn. Without saturation Cn = {0}
-and the hull is P. Theta sharpens it: if no theta that is left is clipped, Cn = {0}; if all of them are clipped by norm,
-y lies in Cn itself, beyond the chord between the ends of the arc in which Q meets the circle. In a dead zone |y| <= w
-the control is zero: if Q holds zero, the ball of radius w joins the hull. All of it is an outer set, whatever is
-approximated.
+and the hull is P. Theta sharpens the set. If no possible theta is clipped, Cn = {0}. If all of them are clipped by
+norm, y lies in Cn itself, beyond the chord between the ends of the arc in which Q meets the circle. In a dead zone |y|
+<= w the control is zero. If Q contains zero, the ball of radius w joins the hull. Every approximation gives an outer
+set.
 """
 
 from __future__ import annotations
@@ -54,10 +54,13 @@ def unclipped(
 
     Args:
         admissible: Q, unit rows over uhat, padded.
-        possible: points whose convex hull holds every y that is still possible: C theta + d at the vertices of Theta
-        [m/s]. margin: how far y may be from that hull [m/s].
+        saturation: how y is clipped.
+        possible: points whose convex hull holds every possible y, namely C theta + d at the vertices of Theta [m/s].
+        margin: the largest distance of y from that hull [m/s].
 
-    `source` is the one of the row of Q that a half-space repeats, and the largest of them, "no single row", elsewhere.
+    Returns:
+        Half-spaces of y. `source` is that of the row of Q that a half-space repeats. Elsewhere it is the largest of
+        these, which means "no single row".
     """
     shape = admissible.batch_shape
     flat = Halfspaces(admissible.A.reshape(-1, admissible.rows, 2), admissible.b.reshape(-1, admissible.rows))
@@ -78,7 +81,7 @@ def _unclipped(
     turn = 2 * math.pi * torch.arange(DIRECTIONS, dtype=like.dtype, device=like.device) / DIRECTIONS
     around = torch.stack([turn.cos(), turn.sin()], dim=-1)
     by_norm = saturation.shape == "norm"
-    # A limit beyond every possible wish is no limit: any finite one serves.
+    # A limit beyond every possible y is no limit, and may be replaced by any finite one.
     farthest = possible.norm(dim=-1).amax(-1, keepdim=True) + margin.unsqueeze(-1)
     limits = torch.minimum(like.new_tensor(saturation.limits), 2 * farthest.detach())
     corner = Polygon.from_box(-limits, limits)
@@ -131,8 +134,11 @@ def _unclipped(
 def _arcs(
     admissible: Halfspaces, limit: Float[Tensor, "B 1"], around: Float[Tensor, "D 2"]
 ) -> tuple[Float[Tensor, "B G 2"], Bool[Tensor, "B G"]]:
-    """Directions in which the circle of radius `limit` is admissible: the ends of its admissible arcs, and all of
-    `around` that lie in them, so that an arc of more than 180 degrees is not taken for the gap between its ends."""
+    """Directions in which the circle of radius `limit` is admissible, and a mask of those that exist.
+
+    They are the ends of the admissible arcs and all of `around` that lie in these arcs. So an arc of more than 180
+    degrees is not taken for the gap between its ends.
+    """
     angle = torch.atan2(admissible.A[..., 1], admissible.A[..., 0])
     half = (admissible.b / limit).clamp(-1, 1).arccos()
     ends = torch.cat([angle - half, angle + half], dim=-1)

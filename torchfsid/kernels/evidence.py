@@ -251,7 +251,7 @@ def evidence(A, b, hard, C, d, u, usable, bound, angles, ball, paper, active_tol
         A: (B, m, 2), the rows over the control.
         b: (B, m), their bounds [m/s].
         hard: (m,), the rows that no controller may violate.
-        C: (B, 2, p), of the nominal control C theta + d.
+        C: (B, 2, 2), of the nominal control C theta + d.
         d: (B, 2), of the nominal control [m/s].
         u: (B, 2), the measured controls [m/s].
         usable: (B,), whether the sample may be used.

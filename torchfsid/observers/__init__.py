@@ -1,3 +1,1 @@
-"""What is known over time: the set-membership observer, the filter, the hybrid of both, and how large the errors of a
-log must be.
-"""
+"""Observers: the set-membership observer, the filter, the hybrid of both, the smallest bounds that explain a log."""

@@ -1,14 +1,14 @@
-r"""How large the errors must be for a log to fit its declared model, whatever the truth is.
+r"""The smallest bounds on errors with which a log fits its declared model, whatever the truth is.
 
     delta_i = min { delta : the sets of robot i's samples with velocity bound delta share a point of the prior }
 
-A set grows with its bound, so bisection finds delta_i; below it no parameter explains robot i. A hard row that is
+A set grows with its bound, so bisection finds delta_i. Below it no parameter explains robot i. A hard row that is
 violated by more than its bound is a contradiction too, if `slack` follows `velocity`. The residual of one sample is the
-same with that sample alone, and with a given Theta for the prior.
+smallest bound for that sample alone, with a given Theta in place of the prior.
 
-Unlike an observer, this knows the whole log: many samples are read at once, each against everything known so far, again
-and again while that shrinks Theta (it can, if the nominal control is clipped). So the sets are never larger than the
-observer's, and an observer with bound delta_i finds no contradiction but by the round-off of what it leaves out.
+Unlike an observer, this reads the whole log. Blocks of samples are read at once with the current Theta. They are read
+again while that shrinks Theta, which is possible if the nominal control is clipped. So the sets are never larger than
+the observer's. An observer with bound delta_i finds no contradiction, up to round-off.
 """
 
 from __future__ import annotations
@@ -56,18 +56,21 @@ class Block:
         )
 
     def repeated(self, of_robots: Tensor) -> Tensor:
-        """What is known of each robot, for each of its samples."""
+        """The values `of_robots`, repeated for each sample of the block."""
         return of_robots.repeat(len(self.times), *[1] * (of_robots.ndim - 1))
 
 
 class Consistency:
-    """A log, read as samples of robots that share a task and barriers.
+    """The consistency of a log with a model of robots that share a task and barriers.
 
     Args:
-        measurements: in the order of time, all of the same robots.
+        measurements: the samples in the order of time, all of the same robots.
+        task: the task of all robots.
+        barriers: the barriers of all robots.
         prior: the robots' prior sets, batch (B,).
-        slack: a bound of its own for the slack; None: that of the velocity.
-        position, neighbour_velocity: see `NoiseBound`.
+        slack: a separate bound for the slack [m/s]; None for that of the velocity.
+        position: see `NoiseBound` [m].
+        neighbour_velocity: see `NoiseBound` [m/s].
     """
 
     def __init__(
@@ -87,7 +90,7 @@ class Consistency:
         self.fastest = max(float(sample.u.norm(dim=-1).max()) for sample in measurements if sample.u is not None)
 
     def smallest_bounds(self, largest: float) -> Float[Tensor, "B"]:
-        """delta_i of every robot [m/s], at most by `RESOLUTION` too large; infinite if it is above `largest`."""
+        """delta_i of every robot [m/s], too large by at most `RESOLUTION`. Infinite if it is above `largest`."""
         high = torch.full((self.robots,), largest, dtype=torch.float64)
         possible = self.sets(high)[1]
         low = torch.full_like(high, min(SMALLEST, largest))
@@ -101,9 +104,9 @@ class Consistency:
     def sets(
         self, velocity: Float[Tensor, "B"], wanted: Bool[Tensor, "B"] | None = None
     ) -> tuple[FeasibleSet, Bool[Tensor, "B"]]:
-        """Theta of every robot with its own velocity bound [m/s], and whether it is free of contradictions.
+        """Theta of every robot for its own velocity bound [m/s], and whether it is free of contradictions.
 
-        It stops as soon as all the `wanted` robots (default: all) are contradicted.
+        The computation stops as soon as all `wanted` robots (default: all) are contradicted.
         """
         wanted = torch.ones(self.robots, dtype=torch.bool) if wanted is None else wanted
         theta, fits = self.prior, torch.ones(self.robots, dtype=torch.bool)
@@ -124,8 +127,10 @@ class Consistency:
                 return theta, fits
 
     def residuals(self, theta: FeasibleSet, largest: float) -> Float[Tensor, "samples B"]:
-        """The smallest bound with which a sample's own set meets Theta [m/s]; NaN where it says nothing, and infinite
-        above `largest`."""
+        """The smallest bound with which each sample's own set meets Theta [m/s].
+
+        It is NaN where the sample says nothing of theta, and infinite above `largest`.
+        """
         found = []
         for block in self.blocks:
             items = len(block.times) * self.robots
@@ -141,7 +146,7 @@ class Consistency:
         return torch.cat(found)
 
     def read(self, block: Block, theta: FeasibleSet, velocity: Float[Tensor, "items"]) -> Evidence:
-        """What a block of samples says, each item with its velocity bound, while Theta is known."""
+        """The evidence of a block of samples, given Theta and a velocity bound [m/s] for each item."""
         slack = None if self.slack is None else torch.full_like(velocity, self.slack)
         noise = NoiseBound(velocity, slack, self.position, self.neighbour_velocity)
         return evidence(ObservationModel(self.task, self.barriers, noise=noise), theta, block.measurement)

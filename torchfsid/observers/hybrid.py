@@ -2,13 +2,13 @@ r"""The hybrid observer: the filter's estimate, brought into the set that must h
 
     theta_hybrid = argmin (theta - theta_ukf)' P^-1 (theta - theta_ukf)   s.t.  theta in Theta(t)
 
-P is the filter's covariance of theta: among the possible parameters, this is the most likely one. A projection onto a
-convex set comes closer, in its own metric, to every point of the set, hence to the truth whenever Theta holds it.
-P itself is never cut by the set: the same set seen at every step would be counted as new information at every step.
+P is the filter's covariance of theta, so this is the most likely of the possible parameters. A projection onto a convex
+set reduces, in its own metric, the distance to every point of the set. So it comes closer to the truth if Theta
+contains it. P itself is never cut by the set, because the same set would count as new information at every step.
 
-The filter is a companion of the set and never decides its life. Where P is not a covariance any more, the projection is
-Euclidean; and where the filter's estimate is not finite, or so far away that its projection has no digits left, the
-centroid of the set takes its place; `status` says so.
+The set does not depend on the filter. Where P is no longer a covariance, the projection is Euclidean. Where the
+filter's estimate is not finite, or so far away that its projection has no accurate digits, the centroid of the set
+replaces it. `status` reports both.
 """
 
 from __future__ import annotations
@@ -32,12 +32,13 @@ CONDITION = 1e10
 
 @dataclass(frozen=True)
 class HybridEstimate:
-    """What both know at time t.
+    """The estimates of both observers at time t.
 
     Attributes:
         t: time [s].
         theta: the filter's estimate projected onto Theta(t).
-        set_estimate, ukf_estimate: what each of the two observers says by itself (with feedback: after it was fed).
+        set_estimate: the estimate of the set-membership observer.
+        ukf_estimate: the estimate of the filter, with feedback after its mean was replaced.
         status: a `HybridStatus` per robot.
     """
 
@@ -53,11 +54,12 @@ class HybridObserver:
     """A set-membership observer and a filter on the same measurements.
 
     Attributes:
-        sets, ukf: the two observers, of the same robots.
-        feedback: the projected mean replaces the filter's own, its covariance stays. Otherwise the filter runs alone.
+        sets: the set-membership observer.
+        ukf: the filter, for the same robots.
+        feedback: whether the projected mean replaces the filter's own. Its covariance stays in either case.
 
     Raises:
-        InputError: the observers have other robots or parameters.
+        InputError: the two observers have different robots or parameters.
     """
 
     sets: SetMembershipObserver
@@ -73,7 +75,7 @@ class HybridObserver:
         """Take in one measurement of all robots.
 
         Raises:
-            InputError: see the two observers.
+            InputError: see `SetMembershipObserver.update` and `ParameterUkf.update`.
         """
         set_estimate = self.sets.update(measurement)
         ukf_estimate = self.ukf.update(measurement)
@@ -84,7 +86,7 @@ class HybridObserver:
 
 
 def _into(sets: FeasibleSet, estimate: UkfEstimate) -> tuple[Float[Tensor, "B p"], Int[Tensor, "B"]]:
-    """The filter's estimates, brought into the sets."""
+    """The filter's estimates projected onto the sets, and a `HybridStatus` for each robot."""
     metric, usable = _information_metric(estimate.covariance)
     known = estimate.theta.isfinite().all(-1)
     start = torch.where(known.unsqueeze(-1), estimate.theta, 0.0)
@@ -101,8 +103,10 @@ def _into(sets: FeasibleSet, estimate: UkfEstimate) -> tuple[Float[Tensor, "B p"
 
 
 def _information_metric(covariance: Float[Tensor, "B p p"]) -> tuple[Float[Tensor, "B p p"], Bool[Tensor, "B"]]:
-    """P^-1, scaled so that its largest eigenvalue is 1 (the nearest point does not depend on the scale); the identity
-    where P is not a covariance. And where it is one."""
+    """The metric P^-1, scaled to the largest eigenvalue 1, and a mask of the items where P is a covariance.
+
+    The nearest point does not depend on the scale. Where P is not a covariance, the metric is the identity.
+    """
     identity = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
     size = covariance.abs().amax((-2, -1), keepdim=True)
     finite = (size.isfinite() & (size > 0)).flatten()

@@ -1,7 +1,7 @@
-"""How a robot moves as a function of theta, from one measurement on: what the filter predicts with.
+"""The velocity of a robot as a function of theta, from one measurement on. The filter predicts with it.
 
-Records, not closures, so that an observer can be pickled. Arrays go in and out: many parameters (S, p) at once give as
-many velocities (S, n).
+Motions are records, not closures, so that an observer can be pickled. They take an array of S parameters (S, p) and
+return an array of S velocities (S, n).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Motion = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class Wish:
-    """uhat = C theta + d, clipped if the task says so."""
+    """The nominal control uhat = C theta + d, clipped if the task has a saturation."""
 
     C: Float[Tensor, "n p"]
     d: Float[Tensor, "n"]
@@ -38,7 +38,7 @@ class Wish:
 
 @dataclass(frozen=True)
 class ObservedMotion:
-    """u = (I - P) uhat + A_a^+ b_a, which is G theta + f where nothing is clipped."""
+    """The motion u = (I - P) uhat + A_a^+ b_a, which is G theta + f where nothing is clipped."""
 
     wish: Wish
     free: Float[Tensor, "n n"]
@@ -50,7 +50,7 @@ class ObservedMotion:
 
 @dataclass(frozen=True)
 class QpMotion:
-    """u = argmin |u - uhat|^2 over the safe controls; zero where there are none."""
+    """The motion u = argmin |u - uhat|^2 over the safe controls. It is zero where there are none."""
 
     wish: Wish
     safe_controls: Halfspaces

@@ -1,4 +1,4 @@
-"""What all observers have in common: measurements in, estimates out."""
+"""The interface of all observers: they take measurements and return estimates."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torchfsid.robots.measurement import Measurement
 
 @runtime_checkable
 class Estimate(Protocol):
-    """What every observer answers: the time [s] and a point estimate of theta."""
+    """The result of every observer: the time [s] and a point estimate of theta."""
 
     @property
     def t(self) -> float: ...
@@ -23,6 +23,6 @@ class Estimate(Protocol):
 
 @runtime_checkable
 class Observer(Protocol):
-    """Measurements in, estimates out, in the order of time."""
+    """An observer takes measurements in the order of time and returns an estimate for each."""
 
     def update(self, measurement: Measurement) -> Estimate: ...

@@ -1,14 +1,14 @@
 r"""The set-membership observer: for each robot and at every moment, the set in which theta must lie.
 
-Per measurement, for all robots in one batch: the barriers give the rows A u <= b, the task gives (C, d), the motion
-shows which rows are active, the KKT conditions become half-spaces, and Theta(t) is what they leave of Theta(t-).
+Each measurement is processed for all robots in one batch. The barriers give the rows A u <= b, the task gives (C, d),
+and the control shows which rows are active. The KKT conditions become half-spaces, with which Theta is intersected.
 
-What can go wrong with data is reported, never hidden in the set:
-    - an empty intersection: the set stays as it was and the robot's status becomes INCONSISTENT, or, if it is known
-      that robots change their minds, the set starts again from the prior;
-    - a hard row violated by more than its bound: model or bounds are wrong, the sample is not used, status ALARM;
-    - a sample that says nothing (`evidence` has the reasons: a controller that failed, something that was not measured,
-      a body left out that could matter) is skipped and counted.
+Failures of the data are reported:
+    - an intersection is empty: the set stays as it was and the robot's status becomes INCONSISTENT. If robots are
+      declared to change their tasks, the set starts again from the prior instead;
+    - a hard row is violated by more than its bound: model or bounds are wrong. The sample is not used, the status is
+      ALARM;
+    - a sample says nothing of theta, for a reason listed in `evidence`: it is skipped and counted.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ OnInconsistent = Literal["hold", "reset", "raise"]
 
 @dataclass(frozen=True)
 class Event:
-    """The first time something went wrong for a robot, or a time at which its set was reset: when, what, the evidence.
+    """The first ALARM or INCONSISTENT of a robot, or a time at which its set was reset, with the rows that caused it.
 
-    `rows` names, as (time, source), the half-spaces that contradict each other (INCONSISTENT) or, for an ALARM, the row
-    that is violated; the sources are those of `critical_region` and `inverse_optimal_set`.
+    `rows` names each row as (time, source). For INCONSISTENT these are the half-spaces that contradict each other, with
+    the sources of `critical_region` or `inverse_optimal_set`. For an ALARM it is the violated row.
     """
 
     t: float
@@ -53,14 +53,14 @@ class Event:
 
 @dataclass(frozen=True)
 class SetEstimate:
-    """What is known at time t.
+    """The sets at time t.
 
     Attributes:
         t: time [s].
         feasible_set: Theta(t) of every robot.
-        evidence: what the measurement says by itself.
-        informative: the sample was used.
-        status: a `Status` per robot; it stays at the worst it has been.
+        evidence: the evidence of this measurement alone.
+        informative: whether the sample was used.
+        status: a `Status` per robot, the worst so far.
     """
 
     t: float
@@ -71,12 +71,12 @@ class SetEstimate:
 
     @property
     def kkt(self) -> KktSolution:
-        """u* = G theta + f at the observed active set."""
+        """The control u* = G theta + f at the observed active set."""
         return self.evidence.kkt
 
     @cached_property
     def theta(self) -> Float[Tensor, "B p"]:
-        """The centroid: unlike the Chebyshev centre it does not jump along a needle."""
+        """The centroid of each set. Unlike the Chebyshev centre it does not jump along an elongated set."""
         return self.feasible_set.centroid()
 
 
@@ -85,15 +85,20 @@ class SetMembershipObserver:
     """Theta(t) for a batch of robots that share a task and barriers.
 
     Attributes:
-        task, barriers, kind, noise, active_tolerance: what is declared, see `ObservationModel`.
-        feasible_set: Theta, at first the prior of every robot, batch (B,).
-        on_inconsistent: what an empty intersection does: `hold` the set as it was, `reset` it to the prior and go on
-            from there (a change of goal; the status stays OK, the event is recorded), or `raise` `InconsistentError`.
-        compiled: see `evidence`; the sets are the same up to round-off.
+        task: see `ObservationModel`.
+        feasible_set: Theta, batch (B,). It starts as the prior of every robot.
+        barriers: see `ObservationModel`.
+        kind: see `ObservationModel`.
+        noise: see `ObservationModel`.
+        active_tolerance: see `ObservationModel`.
+        on_inconsistent: the effect of an empty intersection. `hold` keeps the set as it was. `reset` starts again from
+            the prior, for robots that change their goal: the status stays OK, the event is recorded. `raise` raises
+            `InconsistentError`.
+        compiled: see `evidence`. The sets are the same up to round-off.
         model: the declared model as one record.
-        prior: the sets at first.
+        prior: the initial sets.
         status: a `Status` per robot.
-        skipped: number of samples without information, per robot.
+        skipped: the number of samples without information, per robot.
         events: the first ALARM and INCONSISTENT of each robot, and the times at which sets were reset.
 
     Raises:
@@ -131,7 +136,7 @@ class SetMembershipObserver:
         """Take in one measurement of all robots.
 
         Raises:
-            InputError: see `evidence`; or the robots were measured at different times.
+            InputError: see `evidence`, or the robots were measured at different times.
             InconsistentError: an intersection is empty, and `on_inconsistent` is `raise`.
         """
         t = measurement.time
@@ -147,7 +152,7 @@ class SetMembershipObserver:
         return SetEstimate(t, self.feasible_set, found, informative, self.status)
 
     def _instead(self) -> FeasibleSet:
-        """What takes the place of an empty set."""
+        """The sets that replace empty ones: the sets as they were, or the prior."""
         return self.feasible_set if self.on_inconsistent == "hold" else self.prior
 
     def _report(self, t: float, alarmed: Tensor, slack: Tensor, narrowed: FeasibleSet) -> None:

@@ -1,20 +1,20 @@
-r"""The point estimator that the sets are compared with: an unscented Kalman filter on [x; theta] (G., Secs. II-A, VII).
+r"""A point estimator to compare the sets with: an unscented Kalman filter on [x; theta] (G., Secs. II-A, VII).
 
     x(t + dt) = x(t) + dt (G theta + f) + w_x,   theta(t + dt) = theta(t) + w_theta,   z = x + v
 
-Between two measurements the robot moves with the (G, f) of the active set observed at the earlier one, so the model is
-linear and the filter is a Kalman filter. While two independent rows are active G = 0: it learns nothing. With
-`qp_inside` the velocity is the solution of the safety QP at each sigma point instead: which rows are active then
-depends on theta, the filter learns earlier, and believes itself far too much (its covariance is a local one).
+Between two measurements the robot moves with the (G, f) of the active set observed at the earlier one. So the model is
+linear, and the filter is a Kalman filter. While two independent rows are active, G = 0 and the filter learns nothing.
+With `qp_inside` the velocity is instead the solution of the safety QP at each sigma point. The active rows then depend
+on theta, and the filter learns earlier. Its covariance is a local one and far too small.
 
-What can go wrong with data is reported, never raised:
-    - a robot was not seen, or the motion that followed a measurement cannot be read off it (a neighbour's velocity is
-      not known, a row is violated, the controller failed): the next position says nothing about theta. It starts the
-      position afresh, theta's mean stays, its covariance grows by the drift. Holding the last (G, f) instead would feed
-      the filter a motion that nobody has observed;
-    - the covariance is no longer positive definite (round-off): its eigenvalues, measured in prior and position noise,
-      are raised to `DEFINITE` times the largest. It only grows, so the filter never claims to know more than before;
-    - the filter fails (an overflow, a covariance that cannot be factored): it starts again from its prior.
+Failures of the data are reported as a status and raise nothing:
+    - a robot was not seen, or its motion after a measurement is unknown (a neighbour's velocity is not known, a row is
+      violated, the controller failed). The next position then says nothing about theta. The filter's position starts
+      again from it, theta's mean stays, and its covariance grows by the drift. The last (G, f) is not held, since that
+      motion was not observed;
+    - the covariance is no longer positive definite (round-off). Its eigenvalues, in units of prior and position noise,
+      are raised to `DEFINITE` times the largest. The covariance only grows by this;
+    - the filter fails (an overflow, a covariance that cannot be factored). It starts again from its prior.
 """
 
 from __future__ import annotations
@@ -59,12 +59,13 @@ SIGMA_POINTS = {"alpha": 1.0, "beta": 2.0, "kappa": 0.0}
 
 @dataclass(frozen=True)
 class UkfEstimate:
-    """What the filters believe at time t.
+    """The filters' estimates at time t.
 
     Attributes:
         t: time [s].
-        theta, covariance: mean and covariance of theta.
-        status: a `FilterStatus` per robot, about this measurement alone.
+        theta: the mean of theta.
+        covariance: the covariance of theta.
+        status: a `FilterStatus` per robot, for this measurement alone.
     """
 
     t: float
@@ -78,16 +79,17 @@ class ParameterUkf:
     """One unscented Kalman filter on [x; theta] for each of B robots that share a task and barriers.
 
     Attributes:
-        task, barriers: the declared model.
+        task: the task of all robots.
+        barriers: the barriers of all robots.
         mean: theta's prior mean.
-        spread: standard deviation of theta's prior, one number, one per parameter, or one per robot and parameter.
+        spread: standard deviation of theta's prior: one number, one per parameter, or one per robot and parameter.
         position_noise: standard deviation of a measured position [m]; R is its square.
         process_noise: standard deviation of theta's drift [units of theta per sqrt(s)].
-        motion_noise: standard deviation of what the model's motion leaves out [m/sqrt(s)]. The default allows, at a
-            step of 0.02 s, for a velocity that is off by 7e-3 m/s, as those of inexact solvers are.
-        active_tolerance: distance to its boundary below which a row counts as active; a row violated by more makes
-            the motion unknown [m/s].
-        qp_inside: solve the QP at every sigma point.
+        motion_noise: standard deviation of the error of the model's motion [m/sqrt(s)]. At a step of 0.02 s the default
+            allows for an error of the velocity of 7e-3 m/s, which is usual for inexact solvers.
+        active_tolerance: the slack below which a row counts as active [m/s]. The motion is unknown if a row is violated
+            by more than this.
+        qp_inside: whether to solve the QP at every sigma point.
         filters: filterpy's filter for each robot; None while its position or its motion is not known.
 
     Raises:
@@ -177,8 +179,8 @@ class ParameterUkf:
     def correct(self, theta: Float[Tensor, "B p"]) -> None:
         """Replace the means of theta, keep the covariances.
 
-        The position moves along as it is correlated with theta: the state becomes the one nearest to what it was, in
-        the metric of the whole covariance, that has this theta.
+        The position changes as far as it is correlated with theta. The new state is the nearest one with this theta, in
+        the metric of the whole covariance.
 
         Raises:
             InputError: `theta` is not finite or not (B, p).
@@ -198,7 +200,7 @@ class ParameterUkf:
         self._theta = corrected
 
     def _read_motions(self, measurement: Measurement) -> list[Motion | None]:
-        """How each robot moves from this measurement on, as a function of theta; None where that cannot be read."""
+        """The motion of each robot from this measurement on, as a function of theta. None where it is unknown."""
         assert measurement.u is not None
         rows = stack_barriers(self.barriers, measurement)
         C, d = self.task(measurement)
@@ -249,14 +251,14 @@ class ParameterUkf:
         return FilterStatus.PREDICTED
 
     def _restart(self, i: int, position: Array) -> FilterStatus:
-        """Forget everything but the prior."""
+        """Start robot i's filter again from its prior."""
         mean, covariance = self._prior
         self._theta[i], self._covariance[i] = mean[i], covariance[i]
         self.filters[i] = self._start(i, position)
         return FilterStatus.FAILED
 
     def _start(self, i: int, position: Array) -> UnscentedKalmanFilter:
-        """A filter at a first position, which is all that is known about x, and with what is known about theta."""
+        """A filter at a first measured position, with the current mean and covariance of theta."""
         n, p = len(position), self._theta.shape[-1]
         points = MerweScaledSigmaPoints(n + p, **SIGMA_POINTS)
         kalman = _Filter(n + p, n, dt=math.nan, hx=_position, fx=_move, points=points)
@@ -267,7 +269,7 @@ class ParameterUkf:
         return kalman
 
 
-# What filterpy works with. Functions of this module, not closures, so that an observer can be pickled.
+# The functions given to filterpy. They belong to the module and are no closures, so that an observer can be pickled.
 
 
 class _Filter(UnscentedKalmanFilter):
@@ -286,7 +288,7 @@ def _position(state: Array, n: int) -> Array:
 
 
 def _advance(kalman: UnscentedKalmanFilter, dt: float, motion: Motion, position: Array, scale: Array) -> bool:
-    """Predict and update. The covariance is made definite before filterpy takes its square root; was it repaired?"""
+    """Predict and update. The covariance is made definite before its square root. Returns whether it was repaired."""
     n, repairs = len(position), []
 
     def definite(covariance: Array) -> Array:
@@ -306,7 +308,7 @@ def _advance(kalman: UnscentedKalmanFilter, dt: float, motion: Motion, position:
 
 
 def _make_definite(covariance: Array, scale: Array) -> tuple[Array, bool]:
-    """The symmetric part, and if that is not positive definite, with its eigenvalues (in units of `scale`) raised."""
+    """The symmetric part, with eigenvalues raised (in units of `scale`) if not definite, and whether they were."""
     symmetric = (covariance + covariance.T) / 2
     try:
         np.linalg.cholesky(symmetric)

@@ -1,3 +1,1 @@
-"""What a robot does, the forward model: what is measured of it and how wrong that may be, its task, its barriers, its
-controller, the closed loop.
-"""
+"""The forward model: measurements and bounds on their errors, tasks, barriers, the controller, the closed loop."""

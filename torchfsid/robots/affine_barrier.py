@@ -1,4 +1,4 @@
-"""Rows of one's own: the barrier that is given as a matrix and a vector, and says of itself what it is told to."""
+"""A barrier for the user's own rows, given as a matrix and a vector, with the properties that the user declares."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from torchfsid.robots.measurement import Measurement
 
 @dataclass(frozen=True)
 class AffineBarrier:
-    """Any rows A u <= b: A (m, n) and b (m,), given as tensors or as functions of the measurement.
+    """Any rows A u <= b, with A (m, n) and b (m,) given as tensors or as functions of the measurement.
 
-    Rows given as tensors depend on nothing. Of functions nothing is known but what the other arguments say, and samples
-    for which that matters are skipped.
+    Rows given as tensors are constant. About functions, only what the other arguments declare is known. A sample is
+    skipped if something unknown could matter for it.
 
     Attributes:
-        names: of the rows.
+        names: a name for each row.
         soft: the controller may violate the rows.
-        row_errors: how far the rows may be off where positions have errors; functions need it there.
-        depends_on_bodies: False: the functions look at the robot alone, so that no body without a slot has a row and no
-            neighbour's velocity counts.
-        neighbour_velocity: see `Barrier`; None: unknown.
-        left_out: see `Barrier.slack_left_out`; None: unknown.
+        row_errors: bounds on the errors of the rows. Functions need it if positions have errors.
+        depends_on_bodies: False if the functions use the robot's own state only. Then no body without a slot has a
+            row, and neighbours' velocities do not matter.
+        neighbour_velocity: see `Barrier`; None if unknown.
+        left_out: see `Barrier.slack_left_out`; None if unknown.
     """
 
     A: Tensor | Callable[[Measurement], Tensor]

@@ -1,4 +1,4 @@
-r"""What a robot must not do: rows A(x) u <= b(x) over its control, stacked from the barriers it uses.
+r"""Barriers: rows A(x) u <= b(x) that keep a robot's control safe. Several barriers are stacked.
 
 Avoidance of body j, with dx = x - x_j and h >= 0 the safe side (G., Eq. (6), in the units of control barrier
 functions):
@@ -6,11 +6,11 @@ functions):
     squared    h = |dx|^2 - Ds^2     -2 dx.u        <= alpha(h)  [- 2 dx.u_j]
     euclidean  h = |dx| - Ds         -(dx/|dx|).u   <= alpha(h)  [- (dx/|dx|).u_j]
 
-The bracket is the neighbour's share: nothing (`none`, the paper), its velocity now (`current`: one joint QP over the
-team) or one sample ago (`previous`). The paper's row, a = -dx, b = gamma/2 h, is `squared` with alpha(h) = gamma h,
-halved: the same half-space, and nothing here depends on a row's scale.
+The bracket is the neighbour's share. It is absent (`none`, the paper), or uses the neighbour's velocity now (`current`:
+one joint QP over the team) or one sample ago (`previous`). The paper's row, a = -dx, b = gamma/2 h, is half the row of
+`squared` with alpha(h) = gamma h. It is the same half-space, and nothing here depends on the scale of a row.
 
-A row 0.u <= 1 is padding. A barrier answers for itself whatever generic code needs to know of it (`Barrier`).
+A row 0.u <= 1 is padding. Generic code asks a barrier only through the interface `Barrier`.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ NeighbourVelocity = Literal["none", "current", "previous"]
 class Barrier(Protocol):
     """Rows over the control u.
 
-    Two more answers may be given. A barrier without them is not trusted where they matter: samples are skipped.
+    Two more members are optional. Where one is missing and matters for a sample, the sample is skipped.
 
-        neighbour_velocity          `none`, `current` (one QP decides for the whole team) or `previous`: the velocities
-                                    of other bodies that the rows count. Without it: perhaps `current`.
+        neighbour_velocity          The velocities of other bodies that the rows use: `none`, `current` (one QP decides
+                                    for the whole team) or `previous`. If missing, it may be `current`.
         slack_left_out(measurement) (*batch): the least slack that the row of a body without a slot can have at the
-                                    measured control [m/s], given `measurement.left_out`; infinite if bodies have no
-                                    rows, NaN or -inf if nothing is known. Without it: nothing is known.
+                                    measured control [m/s], given `measurement.left_out`. It is infinite if bodies have
+                                    no rows, and NaN or -inf if nothing is known. If missing, nothing is known.
 
     Attributes:
         soft: the controller may violate the rows (it has slack variables), so that a violation is no alarm.
@@ -55,7 +55,7 @@ class Barrier(Protocol):
     def __call__(self, measurement: Measurement) -> Halfspaces: ...
 
     def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
-        """How far the rows may be off if the measurement is, by at most the bounds."""
+        """Bounds on the errors of the rows, given bounds on the errors of the measurement."""
         ...
 
     def labels(self, bodies: Sequence[str]) -> list[str]:
@@ -64,19 +64,19 @@ class Barrier(Protocol):
 
 
 def stack_barriers(barriers: Sequence[Barrier], measurement: Measurement) -> Halfspaces:
-    """The safe controls: every barrier's rows, one below the other."""
+    """The safe controls: the rows of all barriers, one below the other."""
     return Halfspaces.stack([barrier(measurement) for barrier in barriers])
 
 
 def is_joint(barriers: Sequence[Barrier]) -> bool:
-    """Does one QP decide for the whole team, since some rows count the neighbours' current velocities?"""
+    """Does one QP decide for the whole team? It does if some rows use the neighbours' current velocities."""
     return any(getattr(barrier, "neighbour_velocity", None) == "current" for barrier in barriers)
 
 
 def row_errors(
     barriers: Sequence[Barrier], parts: Sequence[Halfspaces], measurement: Measurement, bounds: ErrorBounds
 ) -> RowErrors:
-    """How far the barriers' rows (`parts`) may be off. A barrier without an answer may be off in any way."""
+    """Bounds on the errors of the barriers' rows (`parts`). Nothing is known of a barrier that gives no bounds."""
     return RowErrors.stack(
         [
             barrier.errors(measurement, bounds) if hasattr(barrier, "errors") else RowErrors.unknown(part.b)
@@ -88,11 +88,11 @@ def row_errors(
 def controller_failed(
     barriers: Sequence[Barrier], measurement: Measurement, rows: Halfspaces, errors: RowErrors | None = None
 ) -> Bool[Tensor, "*batch"]:
-    """Has the controller of each robot found no solution? Then it commands exactly zero, which says nothing.
+    """May the controller of a robot have found no solution? Then it commands exactly zero, which says nothing of theta.
 
-    A robot's own QP has failed if zero violates one of its `rows`; it may have failed if zero violates one that is off
-    by its `errors`. A joint QP stops the whole team, whichever pair is at odds, so it may have failed whenever nobody
-    moves.
+    A robot's own QP has failed if its control is zero and zero violates one of its `rows`. It may have failed if zero
+    violates a row that is wrong by at most its `errors`. A joint QP that fails stops the whole team. So it may have
+    failed whenever no body moves.
     """
     assert measurement.u is not None
     stopped = (measurement.u == 0).all(-1)
@@ -124,11 +124,13 @@ class ClassK:
 
 @dataclass(frozen=True)
 class CollisionAvoidance:
-    """One row per body: stay `safety_distance` [m] away (a tensor (m,): from each its own), or radius_i + radius_j +
-    `margin` [m].
+    """One row per body: keep the distance `safety_distance`, or radius_i + radius_j + `margin`, both in [m].
 
-    Raises `InputError` unless exactly one of the two is given, and when `margin` meets a measurement without radii or
-    `neighbour_velocity` one without the velocities it needs.
+    `safety_distance` may be a tensor (m,), one distance per body.
+
+    Raises:
+        InputError: not exactly one of the two is given. When called: `margin` needs radii, or `neighbour_velocity`
+            needs velocities, that the measurement does not have.
     """
 
     class_k: ClassK
@@ -151,7 +153,7 @@ class CollisionAvoidance:
         Ds = self._safety_distance(measurement.radius, measurement.body_radii)
         if self.distance == "squared":
             h, gradient = squared_distance - Ds**2, 2 * away
-        else:  # at the very place of a body the direction is NaN, and so is the row: it is not known
+        else:  # at the place of a body itself the direction is unknown: the row is NaN
             apart = squared_distance > 0
             distance = torch.where(apart, squared_distance, 1.0).sqrt()
             h = torch.where(apart, distance, 0.0) - Ds
@@ -162,10 +164,11 @@ class CollisionAvoidance:
         return Halfspaces(-gradient, b).where(present)
 
     def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
-        """With r = |dx| known up to e, three things may be off.
+        """Bounds on the errors of the rows, with r = |dx| known up to e.
 
-        The direction, by asin(e/r): any direction if e >= r. The boundary's distance phi(r) = alpha(h)/|dh/dx|, which
-        grows with r, by at most phi(r) - phi(r - e). And u across the turned row, by 2 sin(angle/2) |u - u_j|.
+        The direction is wrong by at most asin(e/r), and unknown if e >= r. The boundary phi(r) = alpha(h)/|dh/dx| grows
+        with r and is wrong by at most phi(r) - phi(r - e). Turning the row changes the slack by at most
+        2 sin(angle/2) |u - u_j|.
 
         Raises:
             InputError: class_k.power < 1/2 with squared distances: phi would not be monotone.
@@ -190,8 +193,9 @@ class CollisionAvoidance:
         return RowErrors(torch.where(present, angle, 0.0), torch.where(present, slack, 0.0))
 
     def slack_left_out(self, measurement: Measurement) -> Float[Tensor, "*batch"]:
-        """phi(R) - |u| - V, with R the least distance of a body left out and V their largest speed (0 if the rows do
-        not count it).
+        """phi(R) - |u| - V, the least slack that the row of a body without a slot can have [m/s].
+
+        R is the least distance of these bodies. V is their largest speed, or 0 if the rows do not use it.
 
         Raises:
             InputError: class_k.power < 1/2 with squared distances: phi would not be monotone.
@@ -217,7 +221,7 @@ class CollisionAvoidance:
             raise InputError("class_k.power", f"at least 1/2 where {where}", self.class_k.power)
 
     def _boundary(self, r: Tensor, Ds: Tensor | float) -> Tensor:
-        """phi(r): how fast the robot may approach a standing body at distance r [m/s]."""
+        """phi(r): the largest speed at which the robot may approach a standing body at distance r [m/s]."""
         if self.distance == "squared":
             return self.class_k(r**2 - Ds**2) / (2 * r)
         return self.class_k(r - Ds)
@@ -239,13 +243,13 @@ class CollisionAvoidance:
 
 
 def _away(measurement: Measurement) -> Float[Tensor, "*batch m n"]:
-    """x - x_j; slots that hold no body get a harmless vector, so that norms and their gradients stay finite."""
+    """x - x_j [m]. Slots without a body get a nonzero vector, so that norms and their gradients are finite."""
     present, away = measurement.present, measurement.x.unsqueeze(-2) - measurement.bodies
     return away if bool(present.all()) else torch.where(present.unsqueeze(-1), away, 1.0)
 
 
 class _OfNoBody:
-    """What a barrier answers whose rows do not depend on other bodies."""
+    """The answers of a barrier whose rows do not depend on other bodies."""
 
     neighbour_velocity: ClassVar[NeighbourVelocity] = "none"
 
@@ -279,8 +283,10 @@ class SpeedBox(_OfNoBody):
 
 @dataclass(frozen=True)
 class SpeedPolygon(_OfNoBody):
-    """u inside a regular polygon of circumradius `limit` [m/s], its first side across the first axis: the usual
-    approximation of |u| <= limit by u_1 <= limit cos(pi/sides) and its rotations (Robotarium's, with 8 sides)."""
+    """u inside a regular polygon of circumradius `limit` [m/s], with its first side across the first axis.
+
+    It approximates |u| <= limit by u_1 <= limit cos(pi/sides) and its rotations. The Robotarium uses 8 sides.
+    """
 
     sides: int
     limit: float

@@ -1,8 +1,8 @@
-"""How wrong what is measured may be: every record of bounds on errors.
+"""The records of bounds on errors.
 
-NoiseBound    declared once, for a whole log: errors of controls, slacks, positions, neighbours' velocities
-ErrorBounds   at one instant: what was declared, and what the measurement itself adds
-RowErrors     what errors of positions come to for the rows of a barrier (`Barrier.errors`)
+NoiseBound    declared once for a whole log: errors of controls, slacks, positions, neighbours' velocities
+ErrorBounds   at one instant: the declared bounds plus those that the measurement itself gives
+RowErrors     errors of a barrier's rows that follow from errors of positions (`Barrier.errors`)
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from torchfsid.robots.measurement import Measurement
 
 @dataclass(frozen=True)
 class NoiseBound:
-    """Bounds on the errors of what is measured, the same at all times.
+    """Bounds on measurement errors, the same at all times.
 
     Attributes:
-        velocity: |u - u*|, of the measured control and of the controller's solver [m/s].
-        slack: how far from its boundary an active row may be measured [m/s]; default: `velocity`.
-        position: of every measured position [m].
-        neighbour_velocity: of the velocities of other bodies, where rows use them [m/s].
+        velocity: a bound on |u - u*|, which counts errors of the measured control and of the controller's solver [m/s].
+        slack: the largest measured slack of a truly active row [m/s]; default: `velocity`.
+        position: a bound on the error of every measured position [m].
+        neighbour_velocity: a bound on the errors of other bodies' velocities, where rows use them [m/s].
 
     `velocity` and `slack` may be tensors (*batch,), a bound for each robot.
     """
@@ -57,9 +57,9 @@ class ErrorBounds(NamedTuple):
     """Bounds on the errors of one measurement.
 
     Attributes:
-        position: of the robots' positions [m].
-        body_position: of the bodies' positions [m].
-        body_velocity: of the bodies' velocities [m/s].
+        position: bound for the robots' positions [m].
+        body_position: bound for the bodies' positions [m].
+        body_velocity: bound for the bodies' velocities [m/s].
     """
 
     position: Float[Tensor, "*batch"]
@@ -68,7 +68,7 @@ class ErrorBounds(NamedTuple):
 
     @classmethod
     def of(cls, measurement: Measurement, noise: NoiseBound | None) -> ErrorBounds | None:
-        """What is declared plus what the measurement adds; None: positions and the bodies' velocities are exact."""
+        """The declared bounds plus those of the measurement. None if positions and bodies' velocities are exact."""
         position, velocity = (0.0, 0.0) if noise is None else (noise.position, noise.neighbour_velocity)
         added = measurement.position_error, measurement.body_position_error, measurement.body_velocity_error
         if position == velocity == 0 and all(error is None for error in added):
@@ -79,11 +79,11 @@ class ErrorBounds(NamedTuple):
 
 
 class RowErrors(NamedTuple):
-    """How far the rows of a barrier may be off.
+    """Bounds on the errors of a barrier's rows.
 
     Attributes:
-        angle: of their direction [rad]; from pi on, nothing is known of it.
-        slack: how much more slack a row that is active may be measured with [m/s]; infinite: any.
+        angle: bound on the error of each row's direction [rad]. From pi on, the direction is unknown.
+        slack: the additional slack with which an active row may be measured [m/s]. Infinite if unknown.
     """
 
     angle: Float[Tensor, "*batch m"]
@@ -91,18 +91,18 @@ class RowErrors(NamedTuple):
 
     @classmethod
     def none(cls, like: Float[Tensor, "*batch m"]) -> RowErrors:
-        """Of rows that are exact."""
+        """The errors of exact rows: zero."""
         nothing = torch.zeros_like(like)
         return cls(nothing, nothing)
 
     @classmethod
     def unknown(cls, like: Float[Tensor, "*batch m"]) -> RowErrors:
-        """Of rows of which nothing is known but that they are there."""
+        """The errors of rows whose direction and slack are unknown."""
         return cls(torch.full_like(like, math.pi), torch.full_like(like, math.inf))
 
     @classmethod
     def stack(cls, parts: Sequence[RowErrors]) -> RowErrors:
-        """Those of several barriers, as their rows are stacked. A number that is NaN is unknown."""
+        """The errors of several barriers, in the order of their stacked rows. NaN counts as unknown."""
         angle, slack = (torch.cat(columns, dim=-1) for columns in zip(*parts, strict=True))
         return cls(
             torch.where(angle.isnan(), math.pi, angle),

@@ -1,10 +1,11 @@
-r"""What a robot does: the safety QP, and the control as a differentiable function of everything it depends on.
+r"""The controller: the safety QP, and its control as a differentiable function of all that it depends on.
 
     u* = argmin |u - uhat|^2  s.t.  A u <= b,      uhat = C theta + d                       (G., Eq. (5))
     uhat - u* = 1/2 sum_j mu_j a_j,   mu_j >= 0,   mu_j (a_j.u* - b_j) = 0                  (G., Eqs. (7)-(10))
 
-It is the point of the safe controls nearest to uhat (`programmes`): exact, and differentiable in theta, positions,
-gains and distances wherever the active set does not switch; at a switch the derivative is that of one side.
+The control u* is the safe control nearest to uhat (`programmes.nearest_point`). It is exact. It is differentiable in
+theta, positions, gains and distances while the active set does not switch. At a switch the derivative is that of one
+side.
 """
 
 from __future__ import annotations
@@ -31,9 +32,10 @@ class QpSolution(NamedTuple):
 
     Attributes:
         u: the controls [m/s]; zero where infeasible.
-        active: rows with a positive multiplier; at most n of them, so one of two equal rows, two of three at a vertex.
-        multipliers: mu_j >= 0 with uhat - u = 1/2 sum_j mu_j a_j, for the rows a_j as they were given.
-        feasible: some control satisfies the rows.
+        active: the rows with a positive multiplier, at most n. So it marks one of two equal rows, and two of three
+            rows at a vertex.
+        multipliers: mu_j >= 0 with uhat - u = 1/2 sum_j mu_j a_j, for the given rows a_j.
+        feasible: whether some control satisfies the rows.
     """
 
     u: Float[Tensor, "*batch n"]
@@ -45,7 +47,7 @@ class QpSolution(NamedTuple):
 def solve_safe_qp(safe_controls: Halfspaces, uhat: Float[Tensor, "*batch n"]) -> QpSolution:
     """The control closest to `uhat` among the safe ones, with gradients. Batches broadcast.
 
-    An item whose rows or nominal control are not finite (two bodies at one place, say) counts as infeasible.
+    An item whose rows or nominal control are not finite counts as infeasible. Two bodies at one place are an example.
 
     Raises:
         InputError: `uhat` has another dimension than the rows.
@@ -64,13 +66,13 @@ def solve_safe_qp(safe_controls: Halfspaces, uhat: Float[Tensor, "*batch n"]) ->
 
 @dataclass(frozen=True)
 class Control:
-    """What the robots do, and why.
+    """The controls of a batch of robots.
 
     Attributes:
         u: the control [m/s]; zero where infeasible.
-        nominal: uhat, what the task alone would do [m/s].
-        active: rows with a positive multiplier (see `QpSolution`).
-        feasible: some control satisfies the rows.
+        nominal: the nominal control uhat of the task [m/s].
+        active: the rows with a positive multiplier (see `QpSolution`).
+        feasible: whether some control satisfies the rows.
     """
 
     u: Float[Tensor, "*batch n"]
@@ -81,15 +83,16 @@ class Control:
 
 @dataclass(frozen=True)
 class CbfQpController:
-    """Do the task, as closely as the barriers allow: `controller(measurement, theta)`.
+    """Follow the task as closely as the barriers allow: `controller(measurement, theta)`.
 
-    If a barrier counts the neighbours' current velocities and the measurement does not hold them, nobody has decided
-    yet: the batch is then a team whose robot i is the body in slot i, the other bodies stand still, and one QP decides
-    for all of them (one infeasible robot then stops the team).
+    A barrier may use the neighbours' current velocities. If the measurement does not hold them, one QP decides for all
+    robots. The batch is then a team whose robot i is the body in slot i, and the other bodies stand still. One
+    infeasible robot stops the whole team.
 
-    Soft barriers are kept like the others: `soft` is what an observer may forgive.
+    The controller keeps soft barriers like all others. `soft` matters only to observers.
 
-    Raises `InputError` if there is no barrier.
+    Raises:
+        InputError: there is no barrier.
     """
 
     task: Task
@@ -100,7 +103,7 @@ class CbfQpController:
             raise InputError("barriers", "at least one barrier", self.barriers)
 
     def __call__(self, measurement: Measurement, theta: Float[Tensor, "*theta_batch p"]) -> Control:
-        """The controls for the parameters `theta`; its batch and the measurement's broadcast.
+        """The controls for the parameters `theta` (*theta_batch, p). Its batch and the measurement's broadcast.
 
         Raises:
             InputError: `theta` does not fit the task, or is not finite.
@@ -121,7 +124,7 @@ class CbfQpController:
         return _control(safe_controls, uhat)
 
     def _team_control(self, measurement: Measurement, uhat: Tensor) -> Control:
-        """One QP over the stacked controls. Row a.u_i - a.u_j <= b of the pair (i, j) stands in it for i and for j."""
+        """One QP over the stacked controls. It holds the row a.u_i - a.u_j <= b of a pair (i, j) for i and for j."""
         if uhat.ndim != 2 or uhat.shape != measurement.x.shape:
             raise InputError("measurement, theta", "one team (robots, n), for a joint QP", tuple(uhat.shape))
         if bool(measurement.present.diagonal().any()):

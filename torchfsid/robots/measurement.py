@@ -1,10 +1,10 @@
-"""What the observer sees at one instant: positions and velocities, nothing else (G., Assumption 1).
+"""A measurement: the positions and velocities that the observer sees at one instant (G., Assumption 1).
 
-A batch of B robots looks at the same M bodies: slot j is body j for every robot, and a mask says which bodies are there
-and are not the robot itself. So a team of N robots is a batch of N with M = N slots, and no index list is ever needed.
-In a fleet that would be N^2 rows: there each robot has the slots of its M nearest bodies (`neighbours`).
+A batch of B robots shares the same M bodies. Slot j is body j for every robot, and a mask says which bodies are present
+and are not the robot itself. So a team of N robots is a batch of N with M = N slots. A fleet would need N^2 rows.
+There, each robot has slots for its M nearest bodies only (`neighbours`).
 
-Time is one more number of each robot: the samples of a whole log, concatenated, are one batch.
+Each robot may have its own time, so that the samples of a whole log can be concatenated into one batch.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ class LeftOut(NamedTuple):
     """Bodies without a slot.
 
     Attributes:
-        distance: none of them is nearer than this [m]; infinite: there are none.
-        speed: none of them is faster than this [m/s]; NaN: unknown.
-        radius: none of them is larger than this [m]; NaN: unknown.
+        distance: a lower bound on their distances [m]; infinite if there are none.
+        speed: an upper bound on their speeds [m/s]; NaN if unknown.
+        radius: an upper bound on their radii [m]; NaN if unknown.
     """
 
     distance: Float[Tensor, "*batch"]
@@ -42,16 +42,19 @@ class Measurement:
     Attributes:
         t: time [s]; a tensor where the robots were measured at different times.
         x: positions [m].
-        u: commands executed from t on, i.e. velocities [m/s]; None before they are known (the forward model).
-        bodies: positions of whatever may have to be avoided [m].
-        present: slot j holds a body that is there at t and is not the robot itself.
+        u: velocities executed from t on, the robots' controls [m/s]; None before they are known (the forward model).
+        bodies: positions of the bodies that may have to be avoided [m].
+        present: whether slot j holds a body that is present at t and is not the robot itself.
         body_velocities: the bodies' velocities at t [m/s]; NaN where unknown.
         previous_body_velocities: their velocities one sample earlier [m/s]; NaN where unknown.
-        radius, body_radii: [m], where known.
-        observed: the robot was measured at t (None: all were). Where False, nobody looks at x and u.
-        position_error, body_position_error: bounds on the error of x and of bodies at this instant [m]; None: zero.
-        velocity_error, body_velocity_error: likewise of u and of the bodies' velocities [m/s].
-        left_out: the bodies without a slot (None: all have one). Samples that they could matter for are not used.
+        radius: the robots' radii [m], if known.
+        body_radii: the bodies' radii [m], if known.
+        observed: whether the robot was measured at t; None if all were. Where False, x and u are not used.
+        position_error: bounds on the error of `x` at this instant [m]; None for zero.
+        body_position_error: bounds on the error of `bodies` [m]; None for zero.
+        velocity_error: bounds on the error of `u` [m/s]; None for zero.
+        body_velocity_error: bounds on the errors of the bodies' velocities [m/s]; None for zero.
+        left_out: the bodies without a slot; None if all have one. A sample for which they could matter is not used.
     """
 
     t: float | Float[Tensor, "*batch"]
@@ -84,9 +87,18 @@ class Measurement:
         position_error: Float[Tensor, "bodies"] | None = None,
         velocity_error: Float[Tensor, "bodies"] | None = None,
     ) -> Measurement:
-        """The batch of the inferred `robots` (indices; default all) among all bodies of a team.
+        """The batch of the inferred `robots` among all bodies of a team.
 
-        `seen` marks the bodies measured at t: the others are no obstacles, and unobserved if they are robots.
+        Args:
+            t: time [s].
+            x: positions of all bodies [m].
+            u: their velocities [m/s].
+            robots: indices of the bodies that are inferred; default all.
+            previous_u: velocities one sample earlier [m/s].
+            radius: radii of the bodies [m].
+            seen: the bodies measured at t; default all. Others are no obstacles, and unobserved if they are robots.
+            position_error: bounds on the errors of `x` [m].
+            velocity_error: bounds on the errors of `u` and `previous_u` [m/s].
 
         Raises:
             InputError: `x`, `u` are not (bodies, n).
@@ -128,10 +140,10 @@ class Measurement:
 
     @property
     def time(self) -> float:
-        """The one time of all robots [s].
+        """The common time of all robots [s].
 
         Raises:
-            InputError: they were measured at different times.
+            InputError: the robots were measured at different times.
         """
         if not isinstance(self.t, Tensor):
             return self.t
@@ -141,7 +153,7 @@ class Measurement:
         return float(times[0])
 
     def select(self, items: Int[Tensor, "k"] | Bool[Tensor, "B"]) -> Measurement:
-        """The robots at these places of a batch (B,); a place may be named more than once."""
+        """The robots at the places `items` of a batch (B,). A place may occur more than once."""
         chosen = {}
         for field in fields(self):
             value = getattr(self, field.name)
@@ -153,13 +165,13 @@ class Measurement:
 
     @classmethod
     def concatenate(cls, parts: Sequence[Measurement]) -> Measurement:
-        """Several batches as one, one after the other; the time becomes a tensor.
+        """Several batches as one, one after the other. The time becomes a tensor.
 
-        What only some of them know is filled up: nobody left out, no error, everybody observed, neighbours' velocities
-        unknown (NaN).
+        A field that only some parts have is filled in the others: no body left out, no error, all robots observed,
+        neighbours' velocities unknown (NaN).
 
         Raises:
-            InputError: there are none, they have different numbers of slots, or only some have controls or radii.
+            InputError: there are no parts, their numbers of slots differ, or only some have controls or radii.
         """
         if len({(part.x.shape[1:], part.bodies.shape[1:]) for part in parts}) != 1 or parts[0].x.ndim != 2:
             shapes = [(tuple(part.x.shape), tuple(part.bodies.shape)) for part in parts[:3]]
@@ -181,7 +193,7 @@ class Measurement:
         return cls(t=torch.cat(times), left_out=left_out, **{name: joined(name) for name in names})  # type: ignore[arg-type]
 
     def observed_only(self) -> Measurement:
-        """With zeros for the positions and controls of robots that were not observed, whatever stood there.
+        """This measurement, with zeros for the positions and controls of robots that were not observed.
 
         Raises:
             InputError: there are no controls, or a number of an observed robot is not finite.
@@ -202,7 +214,7 @@ class Measurement:
 
 
 def _unknown(name: str, part: Measurement) -> Tensor:
-    """What stands for a field that a measurement does not have, and another one has."""
+    """The default value of a field that `part` does not have and another measurement has."""
     if name == "observed":
         return torch.ones_like(part.x[..., 0], dtype=torch.bool)
     if name.endswith("_error"):

@@ -1,19 +1,19 @@
-r"""Fleets: each robot among its nearest bodies only, M slots for N bodies, and what the others may still do.
+r"""Fleets: each robot has M slots for its nearest of N bodies, and the rows of the others are proved inactive.
 
-A body without a slot has no row, and an observer that is missing a truly active row loses the truth. So a robot's
-sample is used only if the rows left out are provably inactive. The row of a body at distance r allows the robot to
-approach at
+A body without a slot has no row, and an observer that lacks a truly active row may lose the truth. So a robot's sample
+is used only if the rows left out are provably inactive. The row of a body at distance r allows the robot to approach it
+at the speed
 
     phi(r) = alpha(h)/|dh/dx|    [m/s],   which grows with r,
 
-so at the robot's control u its slack is at least phi(r) - |u| - |u_j| (the last if the row counts the neighbour's
-velocity). With R the least distance of a body without a slot, V their largest speed, and `bound` the largest slack of
-an active row, the rows left out are inactive if
+So at the robot's control u its slack is at least phi(r) - |u| - |u_j|, the last term only if the row uses the
+neighbour's velocity. Let R be the least distance of a body without a slot, V the largest speed of these bodies, and
+`bound` the largest slack of an active row. The rows left out are inactive if
 
     phi(R) - |u| - V > bound.
 
-Each barrier gives this least slack for itself (`slack_left_out`); one that gives none proves nothing. Bodies beyond a
-sensing radius are at least that far away: the same rule, with R no more than the radius.
+Each barrier computes this least slack (`slack_left_out`). For a barrier that does not, nothing is proved. Bodies beyond
+a sensing radius follow the same rule, with R at most the radius.
 """
 
 from __future__ import annotations
@@ -48,26 +48,26 @@ def nearest_bodies(
     position_error: Float[Tensor, "bodies"] | Float[np.ndarray, "bodies"] | None = None,
     velocity_error: Float[Tensor, "bodies"] | Float[np.ndarray, "bodies"] | None = None,
 ) -> Measurement:
-    """The batch of the inferred `robots`, each among its `count` nearest bodies `within` a distance [m].
+    """The batch of the inferred `robots`, each with slots for its `count` nearest bodies `within` a distance [m].
 
-    Found by a k-d tree: the cost grows with N log N. `left_out` says what is known of the others.
+    They are found by a k-d tree, at a cost that grows as N log N. `left_out` describes the other bodies.
 
     Args:
         t: time [s].
         x: positions of all bodies [m].
         u: their velocities [m/s].
-        count: slots of each robot.
-        within: bodies farther away get no slot [m].
+        count: the number of slots of each robot.
+        within: the distance beyond which bodies get no slot [m].
         robots: indices of the bodies that are inferred; default all.
         previous_u: velocities one sample earlier [m/s].
-        radius: of the bodies [m].
-        seen: the bodies measured at t (default all); the others are no obstacles, and unobserved if they are robots.
+        radius: radii of the bodies [m].
+        seen: the bodies measured at t; default all. Others are no obstacles, and unobserved if they are robots.
         position_error: bounds on the errors of `x` [m].
         velocity_error: bounds on the errors of `u` and `previous_u` [m/s].
 
     Raises:
-        InputError: an argument has another shape or kind than this, a robot is no body, a position of a body that was
-            seen is not finite, or `count` or `within` is not positive.
+        InputError: an argument has the wrong shape or type, an index in `robots` is no body, a position of a body that
+            was seen is not finite, or `count` or `within` is not positive.
     """
     x = _numbers("x", x)
     if x.ndim != 2:
@@ -132,16 +132,18 @@ def left_out_inactive(
     """Are the rows of all bodies without a slot provably inactive?
 
     Args:
+        barriers: the barriers of the robots.
+        measurement: the measurement, with the bodies that it leaves out.
         bound: the largest slack of an active row [m/s].
-        error: of the distance to a body [m].
+        error: a bound on the error of the distance to a body [m].
 
     Raises:
-        InputError: a barrier cannot be asked (class_k.power < 1/2 with squared distances: phi would not grow).
+        InputError: class_k.power < 1/2 with squared distances, so that phi would not grow with the distance.
     """
     left_out = measurement.left_out
     assert left_out is not None
     nearer = replace(measurement, left_out=left_out._replace(distance=left_out.distance - error))
-    inactive = left_out.distance.isinf()  # nobody is left out
+    inactive = left_out.distance.isinf()  # no body is left out
     if bool(inactive.all()):
         return inactive
     proven = torch.ones_like(inactive)
@@ -161,7 +163,7 @@ def _numbers(name: str, value: Any) -> Tensor:
 
 
 def _of_bodies(name: str, value: Any, shape: torch.Size, x: Tensor) -> Tensor | None:
-    """A number or vector for each body."""
+    """The argument as a tensor with a number or vector for each body. Raises `InputError` for another shape."""
     if value is None:
         return None
     value = _numbers(name, value).to(x.device)
@@ -189,12 +191,12 @@ def _indices(robots: Sequence[int] | None, x: Tensor) -> Tensor:
 
 
 def _nearest(x: Tensor, index: Tensor, seen: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """The distances [m] and indices of the count + 1 nearest bodies seen, infinitely far where there are no more."""
+    """The distances [m] and indices of the count + 1 nearest bodies that were seen. Missing ones are infinitely far."""
     from scipy.spatial import KDTree
 
     places, robot, shown = x.detach().cpu().numpy(), index.cpu().numpy(), seen.nonzero().flatten().cpu().numpy()
     here = np.where(np.isin(robot, shown)[:, None], places[robot], 0.0)
-    # One more for the robot itself, one more for the nearest body without a slot; missing ones are infinitely far.
+    # One more for the robot itself, one more for the nearest body without a slot. Missing ones are infinitely far.
     distance, found = KDTree(places[shown]).query(here, k=count + 2)
     body = np.append(shown, -1)[found]
     distance[body == robot[:, None]] = -1.0  # the robot itself comes first, also where bodies share its place

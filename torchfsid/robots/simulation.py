@@ -1,11 +1,11 @@
-r"""Robots in closed loop, sampled: what an observer gets to see, with the truth beside it.
+r"""Sampled simulation of robots in closed loop: the measurements for an observer, together with the truth.
 
     x_i(t + dt) = x_i(t) + dt (u_i(t) + w_i(t)),     u_i(t) = u*(x(t); theta_i)        (G., Eqs. (4), (5))
 
-The control is held for dt; w is a disturbance, or nothing. All robots compute at the same time, from the positions at
-t. `closed_loop` is this loop, sample by sample, for robots with anything around them. `simulate` runs teams in it:
-every robot avoids every other and the obstacles, which stand still. Both are differentiable in theta, start, the places
-of the bodies, gains and distances.
+The control is held for dt. The disturbance w is optional. All robots compute at the same time, from the positions at t.
+`closed_loop` runs robots in any surroundings, sample by sample. `simulate` runs teams: every robot avoids every other
+and the obstacles, which stand still. Both are differentiable in theta, start, the positions of the bodies, gains and
+distances.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class Sample(NamedTuple):
     """One instant of a closed loop.
 
     Attributes:
-        measurement: what the controller saw, with the velocities that the robots executed from then on.
-        control: what the controller decided. Where the QP is infeasible the robot stands still.
+        measurement: the input of the controller, with the velocities that the robots executed from then on.
+        control: the output of the controller. Where the QP is infeasible the robot stands still.
     """
 
     measurement: Measurement
@@ -48,7 +48,7 @@ class Sample(NamedTuple):
 
     @property
     def still(self) -> Bool[Tensor, "*batch"]:
-        """The robot stands still though it has somewhere to go."""
+        """Whether the robot stands still although its nominal control is not zero."""
         return stands_still(self.control.u, self.control.nominal)
 
 
@@ -62,15 +62,16 @@ def closed_loop(
     samples: int,
     disturbance: Float[Tensor, "samples *batch n"] | None = None,
 ) -> Iterator[Sample]:
-    """Run a batch of robots; nothing of the past is kept.
+    """Run a batch of robots and yield one sample after the other. Past samples are not kept.
 
     Args:
+        controller: the controller of all robots.
         theta: the robots' parameters.
         start: their positions at the first sample [m].
-        surroundings: what is around them, asked anew at every sample.
+        surroundings: a function that returns the measurement of the robots' surroundings, called at every sample.
         dt: time between samples [s].
-        samples: how many there are.
-        disturbance: what is added to the controls [m/s].
+        samples: the number of samples.
+        disturbance: velocities that are added to the controls [m/s].
     """
     x, u = start.to(torch.float64), torch.zeros_like(start, dtype=torch.float64)
     for k in range(samples):
@@ -83,16 +84,16 @@ def closed_loop(
 
 @dataclass(frozen=True)
 class Trajectory:
-    """T samples of a team of N robots, which come first, and K obstacles; or of a batch of such teams.
+    """T samples of a team of N robots and K obstacles, or of a batch of such teams. The robots come first.
 
     Attributes:
         t: times [s].
         x: positions of all bodies [m].
         u: their velocities from t on [m/s]; zero for obstacles, and for a robot whose QP is infeasible.
-        nominal: what the robots' tasks alone would do [m/s].
+        nominal: the nominal controls of the robots' tasks [m/s].
         active: the robots' rows with a positive multiplier, in the order of the controller's barriers.
-        feasible: the robot's QP had a solution.
-        radius: of all bodies [m], if given.
+        feasible: whether the robot's QP had a solution.
+        radius: the radii of all bodies [m], if given.
     """
 
     t: Float[Tensor, "samples"]
@@ -109,9 +110,10 @@ class Trajectory:
 
     @property
     def deadlocked_since(self) -> Float[Tensor, "*teams robots"]:
-        """The time from which a robot stands still until the end though it has somewhere to go; NaN if it does not [s].
+        """The time from which a robot stands still until the end although its nominal control is not zero [s].
 
-        A robot stopped by an infeasible QP counts too: `feasible` tells the two apart.
+        It is NaN for a robot that is not deadlocked. A robot stopped by an infeasible QP counts as deadlocked;
+        `feasible` tells the two apart.
         """
         with torch.no_grad():
             stuck = stands_still(self.u[..., : self.robots, :], self.nominal)
@@ -120,7 +122,7 @@ class Trajectory:
             return torch.where(until_the_end > 0, since, torch.nan)
 
     def measurement(self, k: int) -> Measurement:
-        """What is seen of the robots at sample `k`. Before the first sample, everything stood still."""
+        """The measurement of the robots at sample `k`. Before the first sample all velocities are zero."""
         before = torch.zeros_like(self.u[k]) if k == 0 else self.u[k - 1]
         return _of_teams(float(self.t[k]), self.x[k], self.u[k], before, self.robots, self.radius)
 
@@ -139,18 +141,20 @@ def simulate(
     obstacles: Float[Tensor, "*#teams obstacles n"] | None = None,
     radius: Float[Tensor, "*#teams bodies"] | None = None,
 ) -> Trajectory:
-    """Run a team, or a batch of teams, for `steps` steps: steps + 1 samples, the last with its control too.
+    """Run a team, or a batch of teams, for `steps` steps. The result has steps + 1 samples, all with controls.
 
-    Neighbours' velocities are what the barrier says: none, of one sample ago (zero at the first), or current (one QP
-    over the team; one team at a time). A robot whose QP is infeasible stands still for that step, and the run goes on.
+    The barriers choose the neighbours' velocities: none, those of one sample ago (zero at the first), or the current
+    ones. Current velocities need one QP over the team, and one team at a time. A robot whose QP is infeasible stands
+    still for that step, and the run goes on.
 
     Args:
+        controller: the controller of all robots.
         theta: the robots' parameters.
         start: their first positions [m].
         dt: length of a step [s].
-        steps: how many.
-        obstacles: positions of what stands still [m]; their slots come after the robots'.
-        radius: of all bodies, robots first [m]; for barriers given by a margin.
+        steps: the number of steps.
+        obstacles: positions of bodies that stand still [m]. Their slots come after the robots'.
+        radius: radii of all bodies, robots first [m], for barriers given by a margin.
 
     Raises:
         InputError: shapes do not fit, positions are not finite, `dt` or `steps` is not positive.
@@ -193,7 +197,7 @@ def simulate(
 
 
 def stands_still(u: Float[Tensor, "*batch n"], nominal: Float[Tensor, "*batch n"]) -> Bool[Tensor, "*batch"]:
-    """Does a robot stand still though it has somewhere to go?"""
+    """Does a robot stand still although its nominal control is not zero?"""
     speed = nominal.norm(dim=-1)
     return (u.norm(dim=-1) <= STILL * speed) & (speed > IDLE)
 
@@ -201,7 +205,7 @@ def stands_still(u: Float[Tensor, "*batch n"], nominal: Float[Tensor, "*batch n"
 def _of_teams(
     t: float, x: Tensor, u: Tensor | None, previous_u: Tensor, robots: int, radius: Tensor | None
 ) -> Measurement:
-    """What `Measurement.of_team` says of one team whose first bodies are the robots, for a batch of teams."""
+    """`Measurement.of_team` for a batch of teams whose first bodies are the robots."""
     teams, bodies = x.shape[:-2], x.shape[-2]
     slot = torch.arange(bodies, device=x.device)
     radius = None if radius is None else radius.to(torch.float64).expand(*teams, bodies)

@@ -1,9 +1,9 @@
-r"""What a robot wants: nominal controls that are affine in an unknown parameter (G., Sec. III, Assumption 3).
+r"""Tasks: nominal controls that are affine in an unknown parameter (G., Sec. III, Assumption 3).
 
     uhat(x; theta) = C(x) theta + d(x),      C (*batch, n, p),  d (*batch, n).
 
-Every task is a frozen record, called with a `Measurement`, that returns (C, d). The paper asks for such a library of
-task-to-function mappings; the robots of its experiments use `GoalTask`: C = kp I, d = -kp x, theta = x_d.
+Every task is a frozen record. Called with a `Measurement`, it returns (C, d). The paper asks for such a library of
+task-to-function mappings. The robots of its experiments use `GoalTask`: C = kp I, d = -kp x, theta = x_d.
 """
 
 from __future__ import annotations
@@ -26,12 +26,13 @@ Affine = tuple[Float[Tensor, "*batch n p"], Float[Tensor, "*batch n"]]
 
 @dataclass(frozen=True)
 class Saturation:
-    """uhat = clip(C theta + d): by norm, |uhat| <= v, or by axis, |uhat_i| <= v_i; zero below `dead_speed`.
+    """The clipped nominal control uhat = clip(C theta + d), which is zero where |C theta + d| is below `dead_speed`.
 
     Attributes:
-        shape: `norm` or `box`.
-        limits: the v_i [m/s], for `norm` twice the same; infinite if there is a dead zone only.
-        dead_speed: [m/s]; for a goal, its gain times the radius of the dead zone.
+        shape: `norm` for |uhat| <= v, `box` for |uhat_i| <= v_i.
+        limits: the v_i [m/s]. For `norm` both are v. Infinite if there is a dead zone only.
+        dead_speed: the speed below which the control is zero [m/s]. For a goal it is the gain times the radius of the
+            dead zone.
     """
 
     shape: Literal["norm", "box"]
@@ -57,7 +58,11 @@ class Saturation:
 
 @runtime_checkable
 class Task(Protocol):
-    """uhat = C theta + d, clipped if there is a `saturation`. `parameter_names` names the p entries of theta."""
+    """A nominal control uhat = C theta + d, clipped if `saturation` is not None.
+
+    `parameter_names` holds the names of the p entries of theta. `task(measurement)` returns C (*batch, n, p) and
+    d (*batch, n).
+    """
 
     @property
     def parameter_names(self) -> tuple[str, ...]: ...
@@ -68,7 +73,7 @@ class Task(Protocol):
     def __call__(self, measurement: Measurement) -> Affine: ...
 
     def drift(self, bounds: ErrorBounds, largest: Float[Tensor, "*batch p"]) -> Float[Tensor, "*batch"]:
-        """How far C theta + d may be off if positions are, by at most the bounds [m/s]; |theta_i| <= largest_i."""
+        """A bound on the error of C theta + d [m/s], given `bounds` on position errors and |theta_i| <= largest_i."""
         ...
 
 
@@ -132,7 +137,7 @@ class VelocityTask:
 class FormationTask:
     """Keep an offset theta [m] to a leader, the body in slot `leader`: uhat = gain (x_leader + theta - x).
 
-    Where the leader is not present d is NaN: nobody knows what the robot wants then.
+    Where the leader is not present, d is NaN, since the nominal control is unknown.
     """
 
     gain: float | Tensor
@@ -170,9 +175,9 @@ class OrbitTask:
 
 @dataclass(frozen=True)
 class PatrolTask:
-    """Follow a closed path r(t) = c + sum_k a_k cos(k w t) + b_k sin(k w t), w the `rate` [rad/s].
+    """Follow a closed path r(t) = c + sum_k (a_k cos(k w t) + b_k sin(k w t)), w the `rate` [rad/s].
 
-    uhat = gain (r - x) + dr/dt is linear in theta = (c, a_1, b_1, ...) [m], p = 2 + 4 `harmonics`.
+    The nominal control uhat = gain (r - x) + dr/dt is linear in theta = (c, a_1, b_1, ...) [m], p = 2 + 4 `harmonics`.
     """
 
     gain: float
@@ -205,9 +210,10 @@ class PatrolTask:
 
 @dataclass(frozen=True)
 class AffineTask:
-    """Any task that is affine in theta: C (n, p) and d (n,), given as tensors or as functions of the measurement.
+    """Any task that is affine in theta, with C (n, p) and d (n,) given as tensors or as functions of the measurement.
 
-    `sensitivity` bounds how fast C theta + d changes with any position [1/s]; needed only where positions have errors.
+    `sensitivity` bounds the rate at which C theta + d changes with any position [1/s]. It is needed only if positions
+    have errors.
     """
 
     C: Tensor | Callable[[Measurement], Tensor]

@@ -2,15 +2,15 @@ r"""The feasible set Theta(t): where the parameter must lie, given everything se
 
     Theta(t) = Theta_0  intersected with all  Omega(tau), tau <= t          Theta_0 a box, the prior
 
-A set is a value: `intersect` returns the next one. In the plane it is a batch of polygons, elsewhere a batch of
-polytopes; both are differentiable. Its promises, up to round-off: it contains the truth if all half-spaces do; its
-volume never grows; it stays bounded; the order of the half-spaces does not matter, and a smaller bound never gives a
-larger set; it takes the memory of its facets, of which there are at most `max_facets`, merged outward. Each facet
-remembers when and from which constraint it came.
+A set is a value: `intersect` returns a new one. It is a batch of polygons in the plane, and of polytopes in other
+dimensions. Both are differentiable. Up to round-off, a set contains the truth if all half-spaces do. Its volume never
+grows, and it stays bounded. The order of the half-spaces does not matter, and a smaller bound never gives a larger set.
+Its memory is that of its facets. More than `max_facets` are merged outward. Each facet keeps the time and the
+constraint that it came from.
 
-An EMPTY item says so whatever it is asked: it has volume 0 and contains nothing; its centroid, vertices, diameter,
-support, Chebyshev centre and nearest points are NaN; its radius is minus the depth of the contradiction, the least
-distance by which the rows that contradict each other have to be moved outward. All its gradients are zero.
+An EMPTY item has volume 0 and contains nothing. Its centroid, vertices, diameter, support, Chebyshev centre and nearest
+points are NaN. Its radius is minus the depth of the contradiction: the least distance by which the rows that contradict
+each other have to be moved outward. All its gradients are zero.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ MAX_FACETS = 32
 
 
 class Facets(NamedTuple):
-    """Rows of a set, with the time each came [s] (NaN: the prior) and the constraint (`source`; -1: the prior)."""
+    """Rows A z <= b of a set, with the time [s] and the constraint (`source`) of each. The prior has NaN and -1."""
 
     halfspaces: Halfspaces
     time: Float[Tensor, "*batch f"]
@@ -45,13 +45,13 @@ class Facets(NamedTuple):
 
 
 class Emptiness(NamedTuple):
-    """A three-way answer.
+    """Whether a set is empty, with a proof.
 
     Attributes:
-        outcome: an `Outcome` per item. UNDECIDED: some half-space touches the others within round-off, and the set is
-            what they leave if it is moved outward by that round-off.
-        witness: a point inside; NaN unless NONEMPTY.
-        contradiction: the rows that contradict each other; NaN unless EMPTY.
+        outcome: an `Outcome` per item. UNDECIDED means that a half-space touches the others within round-off. The set
+            is what they leave after that half-space is moved outward by its round-off.
+        witness: a point inside. NaN unless NONEMPTY.
+        contradiction: the rows that contradict each other. NaN unless EMPTY.
     """
 
     outcome: Int[Tensor, "*batch"]
@@ -64,12 +64,12 @@ class FeasibleSet:
     """A batch of bounded convex sets of parameters. Build it with `from_box`, shrink it with `intersect`.
 
     Attributes:
-        body: the sets, batch flattened: a `Body`, in the plane a `Polygon`, elsewhere a `Polytope`.
-        batch_shape: the batch.
-        outcome: an `Outcome` per item; an EMPTY item contains nothing and stays empty, whatever its body.
-        contradiction: for EMPTY items the rows that no parameter satisfies together.
-        last_cut: the time of the intersection that last shrank the set [s]; NaN: never.
-        max_facets: facets kept.
+        body: the sets with the batch flattened, a `Polygon` in the plane and a `Polytope` in other dimensions.
+        batch_shape: the shape of the batch.
+        outcome: an `Outcome` per item. An EMPTY item contains nothing and stays empty, whatever its body.
+        contradiction: the rows that no parameter satisfies together, for EMPTY items.
+        last_cut: the time of the intersection that last shrank the set [s]; NaN if there was none.
+        max_facets: the largest number of facets that are kept.
     """
 
     body: Any
@@ -86,8 +86,8 @@ class FeasibleSet:
         """The prior Theta_0 = [lower, upper].
 
         Raises:
-            InputError: shapes differ, or lower < upper fails somewhere, or the box is not bounded, or `max_facets`
-                cannot bound a set.
+            InputError: shapes differ, lower < upper fails somewhere, the box is not bounded, or `max_facets` are too
+                few to bound a set.
         """
         lower, upper = torch.as_tensor(lower).to(torch.float64), torch.as_tensor(upper).to(torch.float64)
         if lower.shape != upper.shape or lower.ndim == 0:
@@ -132,11 +132,11 @@ class FeasibleSet:
         halfspaces: Halfspaces,
         time: float | Float[Tensor, "*batch"] = float("nan"),
     ) -> FeasibleSet:
-        """The part of the set inside the half-spaces, whose facets are stamped with `time` [s] and the rows' `source`
-        (default: 0, 1, ...).
+        """The part of the set inside the half-spaces.
 
-        A row that only touches the set within round-off is moved outward by that round-off and then applied (an outer
-        set). If merging facets would cost more than the cut has gained, the set stays as it was.
+        New facets keep `time` [s] and the rows' `source` (default: 0, 1, ...). A row that only touches the set within
+        round-off is moved outward by that round-off and then applied, so that the result is an outer set. If merging
+        facets would cost more than the cut has gained, the set stays as it was.
 
         Raises:
             InputError: dimension or batch do not fit, or a row is NaN or infinite.
@@ -188,7 +188,7 @@ class FeasibleSet:
         )
 
     def select(self, items: Int[Tensor, "k"]) -> FeasibleSet:
-        """The sets at these places of a batch (B,); a place may be named more than once."""
+        """The sets at the places `items` of a batch (B,). A place may occur more than once."""
         against = self.contradiction
         rows = Halfspaces(against.halfspaces.A[items], against.halfspaces.b[items])
         return replace(
@@ -201,12 +201,12 @@ class FeasibleSet:
         )
 
     def emptiness(self) -> Emptiness:
-        """Is there a parameter left? With the proof, either way."""
+        """Whether a parameter is left, with a proof of either answer."""
         sure = (self.outcome == Outcome.NONEMPTY).unsqueeze(-1)
         return Emptiness(self.outcome, torch.where(sure, self.chebyshev()[0], float("nan")), self.contradiction)
 
     def facets(self) -> Facets:
-        """The half-spaces that make the set, padded with 0.z <= 1; of an EMPTY item, those of the set before."""
+        """The half-spaces that form the set, padded with 0.z <= 1. An EMPTY item gives those of the set before."""
         A, b = self.body.rows()
         return Facets(
             Halfspaces(self._batched(A), self._batched(b)),
@@ -215,7 +215,7 @@ class FeasibleSet:
         )
 
     def contains(self, theta: Float[Tensor, "*batch p"], tolerance: float = 1e-9) -> Bool[Tensor, "*batch"]:
-        """Is theta in the set, up to `tolerance` times its diameter (and round-off)?
+        """Is theta in the set, up to round-off and `tolerance` times the set's diameter?
 
         Raises:
             InputError: theta is not (*batch, p).
@@ -228,31 +228,32 @@ class FeasibleSet:
         return inside.all(-1) & ~self.is_empty
 
     def volume(self) -> Float[Tensor, "*batch"]:
-        """Area in the plane, length in one dimension, volume beyond; 0 for an EMPTY item."""
+        """The length for p = 1, the area in the plane, the volume for p >= 3. 0 for an EMPTY item."""
         return self._unless_empty(self.body.volume(), 0.0)
 
     def vertices(self) -> Float[Tensor, "*batch v p"]:
-        """Vertices (in the plane counter-clockwise), padded by repeating the first one; NaN for an EMPTY item."""
+        """The vertices, padded by repeating the first one, counter-clockwise in the plane. NaN for an EMPTY item."""
         return self._unless_empty(self.body.vertices)
 
     def chebyshev(self) -> tuple[Float[Tensor, "*batch p"], Float[Tensor, "*batch"]]:
-        """Centre and radius of a largest inscribed ball. For elongated sets the centre jumps: see `centroid`.
+        """Centre and radius of a largest inscribed ball.
 
-        The centre of an EMPTY item is NaN, its radius minus the depth of the contradiction.
+        In elongated sets the centre may jump from one measurement to the next; `centroid` does not. The centre of an
+        EMPTY item is NaN, its radius minus the depth of the contradiction.
         """
         centre, radius = self.body.chebyshev()
         return self._unless_empty(centre), self._unless_empty(radius, -self._depth() if self.any_empty else nan)
 
     def centroid(self) -> Float[Tensor, "*batch p"]:
-        """Centre of volume; NaN for an EMPTY item."""
+        """The centre of volume. NaN for an EMPTY item."""
         return self._unless_empty(self.body.centroid())
 
     def diameter(self) -> Float[Tensor, "*batch"]:
-        """Largest distance between two points of the set; NaN for an EMPTY item."""
+        """The largest distance between two points of the set. NaN for an EMPTY item."""
         return self._unless_empty(self.body.diameter())
 
     def support(self, direction: Float[Tensor, "*batch p"]) -> Float[Tensor, "*batch"]:
-        """Support function h(n) = max n.theta over the set; NaN for an EMPTY item.
+        """The support function h(n) = max n.theta over the set, n the `direction`. NaN for an EMPTY item.
 
         Raises:
             InputError: direction is not (*batch, p).
@@ -266,8 +267,8 @@ class FeasibleSet:
     ) -> Float[Tensor, "*batch p"]:
         """The point of the set nearest to `point` in the norm sqrt(z' metric z) (default: Euclidean).
 
-        Only the symmetric part of the metric counts. NaN, with zero gradients, where the metric is not positive
-        definite, where the point or the metric is not finite, and for an EMPTY item.
+        Only the symmetric part of the metric counts. The result is NaN, with zero gradients, for an EMPTY item, and
+        where the metric is not positive definite, or the point or the metric is not finite.
 
         Raises:
             InputError: point is not (*batch, p), or metric is not (*batch, p, p).
@@ -288,21 +289,21 @@ class FeasibleSet:
         return self._unless_empty(torch.where(known.unsqueeze(-1), nearest, nan))
 
     def _depth(self) -> Float[Tensor, "*batch"]:
-        """The depth of the contradictions; NaN where there is none, or none that can be measured."""
+        """The depth of the contradictions. NaN where there is none, or where it has no finite depth."""
         against = self.contradiction.halfspaces
         known = ~(against.A.isnan().any(-1) | against.b.isnan())
         _, radius, _ = inscribed_ball(Halfspaces(against.A, against.b).where(known))
         return torch.where(radius.detach() < 0, -radius.detach(), nan)
 
     def _unless_empty(self, flat: Tensor, instead: float | Tensor = nan) -> Tensor:
-        """The answers of all sets, in the shape of the batch; something else for the EMPTY ones."""
+        """The values `flat` in the shape of the batch, with `instead` for the EMPTY items."""
         answer = self._batched(flat)
         if not self.any_empty:
             return answer
         return torch.where(self.is_empty.reshape((*self.batch_shape, *[1] * (flat.ndim - 1))), instead, answer)
 
     def _check(self, name: str, value: Tensor, shape: tuple[int, ...], broadcast: bool = False) -> None:
-        """Is this one item of a shape for each set, or, with `broadcast`, several?"""
+        """Raise `InputError` unless `value` holds one item of `shape` per set. With `broadcast` it may hold several."""
         batch, inner = value.shape[: value.ndim - len(shape)], tuple(value.shape[value.ndim - len(shape) :])
         fits = inner == shape and _fits(
             batch[max(0, len(batch) - len(self.batch_shape)) if broadcast else 0 :], self.batch_shape
@@ -313,7 +314,7 @@ class FeasibleSet:
             )
 
     def _flat(self, rows: Tensor, shape: tuple[int, ...]) -> Tensor:
-        """One item of this shape for each set, the batch flattened."""
+        """One item of `shape` for each set, with the batch flattened."""
         expanded = (*self.batch_shape, *shape)
         rows = rows if rows.shape == expanded else rows.expand(expanded)
         return rows if len(self.batch_shape) == 1 else rows.reshape(-1, *shape)

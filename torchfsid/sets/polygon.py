@@ -1,14 +1,15 @@
-r"""Batched convex polygons: the sets of parameters in the plane, and what is asked of them.
+r"""Batched convex polygons: the sets of parameters in the plane.
 
-A polygon is a ring of vertices, counter-clockwise, and the half-space row of each edge:
+A polygon is a counter-clockwise ring of vertices, with the half-space row of each edge:
 
     corners (B, V, 2), edge i from corner i to corner i+1 on the line A_i.z = b_i,   A (B, V, 2),  b (B, V)
 
-Polygon k has `count[k]` corners; the slots behind them repeat its first corner and carry padding rows, so that sums and
-extremes over the ring need no mask and no gradient is ever 0/0. Slots grow when a polygon does: nothing overflows.
+Polygon k has `count[k]` corners. The slots behind them repeat its first corner and hold padding rows. So sums and
+extremes over the ring need no mask, and no gradient is 0/0. The number of slots grows with the largest polygon.
 
-The compiled kernels find which rows form the ring, touch the largest disc or are active at the nearest point; all these
-are numbers without gradients. What is asked is then a formula over the rows that were found, differentiable twice.
+The compiled kernels find the rows that form the ring, touch the largest disc or are active at the nearest point. These
+are found without gradients. Vertices, area, disc and nearest point are then formulae of these rows, and are twice
+differentiable.
 """
 
 from __future__ import annotations
@@ -36,11 +37,14 @@ class Polygon:
     """A batch of convex polygons.
 
     Attributes:
-        corners, A, b: vertices and rows, without gradients.
-        time, source: when and from which constraint each edge came; NaN and `PRIOR` for those it began with.
-        label: where the gradient of each row is to be found in `sheets`; 0: nowhere.
+        corners: the vertices, without gradients.
+        A: the rows of the edges, without gradients.
+        b: their right-hand sides, without gradients.
+        time: the time when each edge came [s]; NaN for the edges of the prior.
+        source: the constraint that each edge came from; `PRIOR` for the edges of the prior.
+        label: the place of each edge's row in `sheets`; 0 if it has no gradient.
         count: the number of corners.
-        reach: the largest |coordinate| that the set ever had, for round-off is inherited.
+        reach: the largest |coordinates| that the set ever had, to which its round-off is proportional.
         sheets: the rows with gradients.
     """
 
@@ -56,7 +60,7 @@ class Polygon:
 
     @classmethod
     def from_box(cls, lower: Float[Tensor, "B 2"], upper: Float[Tensor, "B 2"]) -> Polygon:
-        """Axis-parallel rectangles; edges: bottom, right, top, left."""
+        """Axis-parallel rectangles with the edges bottom, right, top, left."""
         (x0, y0), (x1, y1) = lower.unbind(-1), upper.unbind(-1)
         ring = [torch.stack(corner, dim=-1) for corner in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))]
         A = lower.new_tensor([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]]).expand(len(lower), 4, 2)
@@ -83,20 +87,20 @@ class Polygon:
 
     @property
     def valid(self) -> Bool[Tensor, "B V"]:
-        """Slots that hold a corner (and its edge)."""
+        """A mask of the slots that hold a corner and its edge."""
         return torch.arange(self.slots, device=self.count.device) < self.count.unsqueeze(-1)
 
     def fields(self) -> tuple[Tensor, ...]:
-        """Everything but the sheets."""
+        """All fields except the sheets."""
         return self.corners, self.A, self.b, self.time, self.source, self.label, self.count, self.reach
 
     def select(self, items: Int[Tensor, "k"]) -> Polygon:
-        """The sub-batch at `items`, without the slots that none of it needs."""
+        """The sub-batch at `items`, with no more slots than it needs."""
         slots = int(self.count[items].max()) if len(items) > 0 else self.slots
         return Polygon(*(part.index_select(0, items) for part in self._resized(slots)), sheets=self.sheets)._pruned()
 
     def replaced(self, items: Int[Tensor, "k"], other: Polygon) -> Polygon:
-        """This batch with `other` in the places `items`, and no more slots than that needs."""
+        """This batch with the polygons of `other` at the places `items`, with no more slots than it needs."""
         if len(items) == 0:
             return self
         sheets, label = self.sheets.joined(other.sheets, other.label)
@@ -107,12 +111,12 @@ class Polygon:
         return Polygon(*parts, sheets=sheets)._pruned()
 
     def _pruned(self) -> Polygon:
-        """Without the sheets of rows that are no edges any more."""
+        """This batch without the sheets whose rows are no longer edges."""
         sheets, label = self.sheets.in_use(self.label)
         return self if sheets is self.sheets else replace(self, label=label, sheets=sheets)
 
     def _resized(self, slots: int) -> tuple[Tensor, ...]:
-        """The fields with so many slots."""
+        """The fields with `slots` slots."""
         rings, extra = self.fields()[:6], slots - self.slots
         if extra <= 0:
             rings = tuple(part[:, :slots] for part in rings)
@@ -132,7 +136,7 @@ class Polygon:
         source: Int[Tensor, "B R"],
         most: int,
     ) -> Clipped:
-        """See `Body`. Edges whose neighbours cannot be extended to meet (of a parallelogram) are never merged."""
+        """See `Body.clip`. An edge with parallel neighbours, as in a parallelogram, is never merged."""
         differentiable = torch.is_grad_enabled() and (A.requires_grad or b.requires_grad)
         first = 1 + self.sheets.rows if differentiable else 0
         parts, outcome, shrunk, entered, against = kernel.clip(
@@ -150,10 +154,10 @@ class Polygon:
         body = Polygon(*(torch.from_numpy(part).to(device) for part in parts), sheets=sheets)
         return Clipped(body._pruned(), outcomes, smaller, contradiction)
 
-    # What is asked of a polygon ------------------------------------------------------------------------------------
+    # Geometry -------------------------------------------------------------------------------------------------------
 
     def rows(self) -> tuple[Float[Tensor, "B V 2"], Float[Tensor, "B V"]]:
-        """A and b with the gradients of the rows that they are."""
+        """A and b, with the gradients of the given rows that have become edges."""
         return self.sheets.attached(self.A, self.b, self.label)
 
     @property
@@ -164,15 +168,15 @@ class Polygon:
         return derivatives.vertices(*self.rows(), self._skeleton())
 
     def volume(self) -> Float[Tensor, "B"]:
-        """Area, by the shoelace formula about the first corner, which keeps thin polygons exact."""
+        """The area by the shoelace formula about the first corner, which is accurate for thin polygons."""
         return self._measure()[0] if self._differentiable() else self._triangles().sum(-1)
 
     def centroid(self) -> Float[Tensor, "B 2"]:
-        """Centre of area; of a polygon whose area is lost in round-off, the middle of its bounding box."""
+        """The centre of area. If the area is lost in round-off, it is the middle of the bounding box."""
         return self._measure()[1]
 
     def diameter(self) -> Float[Tensor, "B"]:
-        """Largest distance between two points of the set."""
+        """The largest distance between two points of the set."""
         apart = (self.corners.unsqueeze(1) - self.corners.unsqueeze(2)).square().sum(-1).flatten(1)
         ends = apart.argmax(-1, keepdim=True)
         vertices = self.vertices
@@ -181,7 +185,7 @@ class Polygon:
         return torch.where(squared > 0, squared.clamp(min=1e-300).sqrt(), 0.0)
 
     def support(self, direction: Float[Tensor, "B D 2"]) -> Float[Tensor, "B D"]:
-        """Support function h(n) = max n.z over the set; between tied vertices the derivatives of the first one."""
+        """The support function h(n) = max n.z over the set. Tied vertices give the derivatives of the first one."""
         furthest = (direction.detach() @ self.corners.mT).argmax(-1)
         return (direction * at(self.vertices, furthest)).sum(-1)
 
@@ -189,7 +193,8 @@ class Polygon:
         """Centre and radius of a largest inscribed disc: max r s.t. A_i.z + |A_i| r <= b_i.
 
         Where the centre is not unique (two parallel edges touch the disc), an end of the segment of centres is
-        returned, with the gradient of the three rows that decide it so; the radius and its gradient are right anyway.
+        returned. Its gradient is that of the three rows that decide this choice. The radius and its gradient are right
+        in any case.
         """
         numbers = disc.inscribed(*map(array, (self.corners, self.A, self.b, self.count)))
         centre, radius, rows, found = (torch.from_numpy(part).to(self.b.device) for part in numbers)
@@ -209,8 +214,8 @@ class Polygon:
         found, active = (torch.from_numpy(part).to(point.device) for part in numbers)
         if not self._differentiable(point, H):
             return found
-        # Two equations M z = right: the active rows; for a foot on an edge t'H (z - point) = 0 along the edge t; and
-        # z = point inside.
+        # Two equations M z = right. At a vertex they are the active rows. On an edge t, the second one is
+        # t'H (z - point) = 0. Inside, they are z = point.
         A, b = self.rows()
         N, right = at(A, active.clamp(min=0)), at(b, active.clamp(min=0))
         along = torch.stack([-N[:, 0, 1], N[:, 0, 0]], dim=-1)
@@ -223,13 +228,13 @@ class Polygon:
         M, right = torch.where(inside[:, None, None], eye, M), torch.where(inside.unsqueeze(-1), point, right)
         return derivatives.solution(found, M, right, independent(M[:, 0], M[:, 1]))
 
-    # How they are found --------------------------------------------------------------------------------------------
+    # Parts of the computation ---------------------------------------------------------------------------------------
 
     def _differentiable(self, *others: Tensor) -> bool:
         return torch.is_grad_enabled() and (bool(self.sheets.sheets) or any(other.requires_grad for other in others))
 
     def _triangles(self) -> Float[Tensor, "B V"]:
-        """Areas of the triangles (first corner, corner i, corner i+1)."""
+        """The areas of the triangles (first corner, corner i, corner i+1)."""
         spokes = self.corners - self.corners[:, :1]
         return cross(spokes, spokes.roll(-1, 1)) / 2
 
@@ -246,7 +251,7 @@ class Polygon:
         return area, centroid
 
     def _solid(self, area: Float[Tensor, "B"]) -> Bool[Tensor, "B"]:
-        """Is the area more than the round-off of coordinates as large as these leaves open?"""
+        """Is the area larger than its own round-off, given the size of the coordinates?"""
         size = (self.corners.amax(1) - self.corners.amin(1)).amax(-1)
         return area > ROUND_OFF * size * torch.maximum(size, self.corners.abs().amax((1, 2)))
 
@@ -260,7 +265,7 @@ class Polygon:
         return Skeleton(self.corners, bases, solved, ends, facet, self._solid(self._triangles().sum(-1)))
 
     def _disc_by_programme(self) -> tuple[Float[Tensor, "B 2"], Float[Tensor, "B"]]:
-        """The inscribed disc by the programme for half-spaces of any dimension."""
+        """The inscribed disc by `programmes.inscribed_ball`, which works in any dimension."""
         centre = self.corners.mean(1)
         offsets = self.b - (self.A @ centre.unsqueeze(-1)).squeeze(-1)
         step, radius, _, status = map(torch.from_numpy, exact.inscribed_ball(array(self.A), array(offsets)))
@@ -271,7 +276,7 @@ class Polygon:
 
 
 def independent(v: Float[Tensor, "*B 2"], w: Float[Tensor, "*B 2"]) -> Bool[Tensor, "*B"]:
-    """Do two lines with these normals meet in a point?"""
+    """Do two lines with the normals v and w meet in a point?"""
     v, w = v.detach(), w.detach()
     return cross(v, w).abs() > PARALLEL_EDGES * torch.linalg.vector_norm(v, dim=-1) * torch.linalg.vector_norm(
         w, dim=-1

@@ -1,9 +1,10 @@
-r"""Batched convex polytopes: the sets of parameters beyond the plane (p = 1, 3, 4, ...), and what is asked of them.
+r"""Batched convex polytopes: the sets of parameters in other dimensions than the plane (p = 1, 3, 4, ...).
 
-The counterpart of `polygon`, behind the same interface. What has to be found is found in numpy, without gradients:
-which facets are left after a clip in `cell`, volume and centroid in `shape`, the nearest point and the inscribed ball
-in `programmes`. Every facet is one of the rows that were given, and carries its gradient. What follows from the facets
-is differentiable in them, twice. Whatever round-off leaves open stays in: every set is an outer set.
+They have the interface of `polygon`. Searches run in numpy, without gradients. `cell` finds the facets that are left
+after a clip, `shape` finds volume and centroid, `programmes` finds the nearest point and the inscribed ball. Every
+facet is one of the given rows and carries its gradient. Vertices, volume, centroid, ball and nearest point are twice
+differentiable functions of the facets. A point is removed only if it is outside beyond round-off: every set is an outer
+set.
 """
 
 from __future__ import annotations
@@ -35,13 +36,15 @@ class Polytope:
     """A batch of bounded convex polytopes {z : A z <= b} in R^p, float64.
 
     Attributes:
-        A, b: the facets' rows, padded with 0.z <= 1. A row that only touched has moved outward by its round-off.
-        time, source: when and from which constraint each facet came; NaN and `PRIOR` for the first box.
-        count: how many facets are real.
+        A: the facets' rows, padded with 0.z <= 1.
+        b: their right-hand sides. A row that only touched the set has been moved outward by its round-off.
+        time: the time when each facet came [s]; NaN for the facets of the prior.
+        source: the constraint that each facet came from; `PRIOR` for the facets of the prior.
+        count: the number of real facets.
         corners: the vertices, without gradients, padded with copies of the first one.
-        incident: which vertex is on which facet; padding is on none.
-        vertex_count: how many vertices are real.
-        reach: the largest |coordinate| that the set ever had, for round-off is inherited.
+        incident: which vertex is on which facet. Padding is on none.
+        vertex_count: the number of real vertices.
+        reach: the largest |coordinates| that the set ever had, to which its round-off is proportional.
     """
 
     A: Float[Tensor, "B F p"]
@@ -56,7 +59,7 @@ class Polytope:
 
     @classmethod
     def from_box(cls, lower: Float[Tensor, "B p"], upper: Float[Tensor, "B p"]) -> Polytope:
-        """Axis-parallel boxes; facets: the lower sides -z_i <= -lower_i, then the upper sides z_i <= upper_i."""
+        """Axis-parallel boxes. Facets: first the lower sides -z_i <= -lower_i, then the upper sides z_i <= upper_i."""
         B, p = lower.shape
         unit, b = torch.eye(p, dtype=lower.dtype, device=lower.device), torch.cat([-lower, upper], dim=-1)
         A, nothing = torch.cat([-unit, unit]).expand(B, 2 * p, p), torch.full_like(b, nan)
@@ -70,7 +73,7 @@ class Polytope:
 
     @property
     def valid(self) -> Bool[Tensor, "B F"]:
-        """Slots that hold a facet."""
+        """A mask of the slots that hold a facet."""
         return torch.arange(self.A.shape[1], device=self.count.device) < self.count.unsqueeze(-1)
 
     def select(self, items: Tensor) -> Polytope:
@@ -79,7 +82,7 @@ class Polytope:
         return self._of([self._cells[i] for i in chosen], [origins[i] for i in chosen], _Rows.join(self._rows()))
 
     def replaced(self, items: Tensor, other: Polytope) -> Polytope:
-        """This batch with `other` in the places `items` (indices or a mask)."""
+        """This batch with the polytopes of `other` at the places `items` (indices or a mask)."""
         cells, origins, others = list(self._cells), self._origins(), other._origins(first=self.b.numel())
         for i, cell, origin in zip(self._positions(items), other._cells, others, strict=True):
             cells[i], origins[i] = cell, origin
@@ -98,14 +101,14 @@ class Polytope:
         outcome, shrunk, rows, right = np.full(B, int(Outcome.NONEMPTY)), np.zeros(B, dtype=bool), array(A), array(b)
         for i in np.flatnonzero(self._exceeded(rows, right)):
             found = intersect(cells[i], rows[i], right[i])
-            # Among all rows, those of the polytopes come first, item by item.
+            # The polytopes' own rows come first among all rows, item by item.
             place = np.append(B * F + i * R + np.arange(R), i * F + np.arange(F))
             outcome[i] = found.outcome
             against[i, : len(found.contradiction)] = place[found.contradiction]
             if found.cell is cells[i]:
                 continue
             cell, kept = merged(found.cell, most)
-            # Merging that costs more than the cut has gained is not worth it.
+            # Where merging costs more than the cut has gained, the polytope stays as it was.
             if cell is found.cell or cell.content <= cells[i].content:
                 cells[i], origins[i], shrunk[i] = cell, place[found.origin[kept]], True
         table = _Rows.join(self._rows(), (A, b, time.unsqueeze(-1).expand(B, R), source))
@@ -114,42 +117,43 @@ class Polytope:
         return Clipped(self._of(cells, origins, table) if shrunk.any() else self, outcomes, cut, contradiction)
 
     def merge(self, most: int) -> Polytope:
-        """Outer polytopes with at most `most` facets: drop, one by one, the facet whose removal adds the least volume.
+        """Outer polytopes with at most `most` facets.
 
-        A facet that keeps the set bounded is never dropped, so that more than `most` may remain.
+        The facet whose removal adds the least volume is dropped, one by one. A facet without which the set would be
+        unbounded is never dropped. So more than `most` may remain.
         """
         cells, kept = zip(*(merged(cell, most) for cell in self._cells), strict=True)
         origins = [origin[some] for origin, some in zip(self._origins(), kept, strict=True)]
         return self._of(list(cells), origins, _Rows.join(self._rows()))
 
     def rows(self) -> tuple[Float[Tensor, "B F p"], Float[Tensor, "B F"]]:
-        """A and b; each row carries its gradient."""
+        """A and b, with the gradients of the given rows that have become facets."""
         return self.A, self.b
 
-    # What is asked of a polytope ------------------------------------------------------------------------------------
+    # Geometry -------------------------------------------------------------------------------------------------------
 
     @property
     def vertices(self) -> Float[Tensor, "B V p"]:
-        """The vertices. Where more than p facets meet, p of them, as different as they come, decide its gradient."""
+        """The vertices. Where more than p facets meet, p of them decide the gradient, with directions far apart."""
         return sensitivity.vertices(self.A, self.b, self.corners, self.shape) if self._differentiable else self.corners
 
     def volume(self) -> Float[Tensor, "B"]:
-        """Volume (in one dimension, length); 0 for a flat set, one whose width is lost in round-off."""
+        """The volume, or the length for p = 1. It is 0 for a flat set, whose width is lost in round-off."""
         return self._measure[0]
 
     def centroid(self) -> Float[Tensor, "B p"]:
-        """Centre of volume; of a flat set (a facet, an edge, a point) the centre of that."""
+        """The centre of volume. For a flat set (a facet, an edge, a point) it is the centre of that."""
         return self._measure[1]
 
     def diameter(self) -> Float[Tensor, "B"]:
-        """Largest distance between two points of the set."""
+        """The largest distance between two points of the set."""
         apart = torch.cdist(self.corners, self.corners, compute_mode="donot_use_mm_for_euclid_dist").flatten(1)
         furthest, at = apart.argmax(-1), torch.arange(len(apart), device=apart.device)
         vertices, V = self.vertices, self.corners.shape[1]
         return torch.linalg.vector_norm(vertices[at, furthest // V] - vertices[at, furthest % V], dim=-1)
 
     def support(self, direction: Float[Tensor, "B D p"]) -> Float[Tensor, "B D"]:
-        """Support function h(n) = max n.z over the set."""
+        """The support function h(n) = max n.z over the set, n the `direction`."""
         values = direction @ self.vertices.transpose(1, 2)
         return values.gather(-1, values.detach().argmax(-1, keepdim=True)).squeeze(-1)
 
@@ -157,8 +161,8 @@ class Polytope:
         """Centre and radius of a largest inscribed ball: max r s.t. A_f.z + |A_f| r <= b_f.
 
         Where the centre is not unique, the one with the smallest z_1 is returned, among these the one with the smallest
-        z_2, and so on, with the gradient of the p + 1 facets that decide it so. The radius and its gradient are right
-        in any case. A flat set has the radius 0, around a point of it.
+        z_2, and so on. Its gradient is that of the p + 1 facets that decide this choice. The radius and its gradient
+        are right in any case. A flat set has the radius 0, and its centre is a point of the set.
         """
         ball = inscribed_ball(self._recentred)
         flat = ball.radius <= FLAT * self.reach.amax(-1)
@@ -170,21 +174,21 @@ class Polytope:
     ) -> Float[Tensor, "B p"]:
         """The point of the set nearest to `point` in the norm sqrt(z' metric z) (default: Euclidean).
 
-        NaN where `point` or `metric` is not finite, or `metric` not positive definite.
+        The result is NaN where `point` or `metric` is not finite, or `metric` is not positive definite.
         """
         rows, point = self._recentred, point - self._middle
         found = nearest_point(rows, point, metric)
         lost = found.status == ProgrammeStatus.EMPTY
-        if bool(lost.any()):  # by the round-off of the middle, that of a flat set
+        if bool(lost.any()):  # lost to the round-off of the middle, as in a flat set
             wider = rows.b + torch.where(lost.unsqueeze(-1), 2 * self._round_off, 0.0)
             found = nearest_point(Halfspaces(rows.A, wider), point, metric)
         return self._middle + found.point
 
-    # How it is kept -------------------------------------------------------------------------------------------------
+    # Parts of the computation ---------------------------------------------------------------------------------------
 
     @cached_property
     def shape(self) -> Shape:
-        """Without gradients, in numpy."""
+        """The shape of the polytopes, in numpy, without gradients."""
         fields = (self.A, self.b, self.corners, self.vertex_count, self.incident, self.reach)
         return Shape(*(array(field) for field in fields))
 
@@ -206,7 +210,7 @@ class Polytope:
 
     @property
     def _measure(self) -> tuple[Tensor, Tensor]:
-        """Volume and centroid."""
+        """Volume and centroid, with gradients if the rows require them."""
         if self._differentiable:
             return sensitivity.measure(self.A, self.b, self.shape)
         return self._as_tensor(self.shape.volume), self._as_tensor(self.shape.centroid)
@@ -218,19 +222,19 @@ class Polytope:
 
     @property
     def _recentred(self) -> Halfspaces:
-        """The set with its middle moved to the origin, so that round-off is that of its size."""
+        """The set with its middle moved to the origin. Its round-off is then proportional to its size."""
         return Halfspaces(self.A, self.b - times(self.A, self._middle))
 
     @property
     def _round_off(self) -> Float[Tensor, "B F"]:
-        """Round-off of A z - b over the set."""
+        """A bound on the rounding error of A z - b over the set."""
         return (ROUND_OFF * (times(self.A.abs(), self.reach) + self.b.abs())).detach()
 
     def _as_tensor(self, field: Reals) -> Tensor:
         return torch.as_tensor(field, device=self.A.device)
 
     def _exceeded(self, A: Reals, b: Reals) -> Mask:
-        """(B,), does some row (B, R, p) cut by more than round-off?"""
+        """Does some row (B, R, p) cut the item by more than round-off? A mask (B,)."""
         tolerance = ROUND_OFF * ((np.abs(A) @ array(self.reach)[..., None])[..., 0] + np.abs(b))
         return ((A @ array(self.corners).swapaxes(1, 2)).max(-1) - b > tolerance).any(-1)
 
@@ -241,14 +245,17 @@ class Polytope:
         return self.A, self.b, self.time, self.source
 
     def _origins(self, first: int = 0) -> list[Indices]:
-        """Where the facets of each item stand among all rows, if the batch's begin with number `first`."""
+        """The indices of each item's facets among all rows, if the rows of this batch begin at index `first`."""
         F = self.b.shape[1]
         return [first + i * F + np.arange(len(cell.b)) for i, cell in enumerate(self._cells)]
 
     @classmethod
     def _of(cls, cells: list[Cell], origins: Sequence[Indices], rows: _Rows) -> Polytope:
-        """The batch of these cells, padded to the largest. Their facets are taken from `rows`, with their gradients;
-        their numbers b from the cells, where some have been moved outward."""
+        """The batch of these cells, padded to the largest.
+
+        The facets and their gradients are taken from `rows`. The values of b are taken from the cells, where some rows
+        have been moved outward.
+        """
         p, device = rows.A.shape[-1], rows.A.device
         counts = np.array([[len(cell.b), len(cell.vertices)] for cell in cells], dtype=np.int64).reshape(-1, 2)
         B, (F, V) = len(cells), np.maximum(counts.max(0, initial=1), (1, p))
@@ -267,7 +274,7 @@ class Polytope:
 
 
 class _Rows(NamedTuple):
-    """Half-spaces in one row, with their provenance."""
+    """Half-spaces in one flat list, with the time and source of each."""
 
     A: Float[Tensor, "N p"]
     b: Float[Tensor, "N"]
@@ -276,11 +283,11 @@ class _Rows(NamedTuple):
 
     @classmethod
     def join(cls, *batches: tuple[Tensor, Tensor, Tensor, Tensor]) -> _Rows:
-        """Of each batch, A (B, R, p), b, time and source (B, R), item by item."""
+        """The flat list of several batches, each A (B, R, p), b, time and source (B, R), item by item."""
         return cls(*(torch.cat([field.flatten(0, 1) for field in fields]) for fields in zip(*batches, strict=True)))
 
     def at(self, index: Int[Tensor, "B K"], fill_A: float, fill_b: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The rows at these places; where the index is -1, A and b are filled in, of the prior."""
+        """The rows at the places `index`. Where it is -1, A and b are `fill_A` and `fill_b`, with the prior's stamp."""
         none = index < 0
         return (
             torch.where(none.unsqueeze(-1), fill_A, self.A[index]),

@@ -1,8 +1,9 @@
-"""Where the gradients of a set's facets come from: the rows that were given, as long as a facet of the set is one.
+"""The given rows whose gradients the facets of a set carry. They are kept as long as a facet of the set needs them.
 
-A search works on numbers. The rows that it has made facets, with their gradients, are kept beside it in sheets, one for
-each intersection; every facet has a label, the place of its row among all sheets, or 0 if it has no gradient. A sheet
-that no facet refers to is dropped, and with it the graph of that intersection: memory is facets.
+A search works on numbers without gradients. The rows that have become facets are kept beside it, with gradients, in
+sheets, one for each intersection. Every facet has a label: the place of its row among all sheets, or 0 if it has no
+gradient. A sheet that no facet refers to is dropped with the autograd graph of its intersection. So memory is
+proportional to the number of facets.
 """
 
 from __future__ import annotations
@@ -19,25 +20,25 @@ from torchfsid.halfspaces import array
 
 @dataclass(frozen=True)
 class Sheets:
-    """Rows A (N, p) and b (N,) with gradients, sheet by sheet; the first row of the first sheet has the label 1.
+    """Rows A (N, p) and b (N,) with gradients, sheet by sheet. The first row of the first sheet has the label 1.
 
     Attributes:
-        sheets: A and b of each.
-        rows: how many rows there are in all of them.
+        sheets: A and b of each sheet.
+        rows: the number of rows in all sheets.
     """
 
     sheets: tuple[tuple[Tensor, Tensor], ...] = ()
     rows: int = 0
 
     def with_sheet(self, A: Float[Tensor, "N p"], b: Float[Tensor, "N"]) -> Sheets:
-        """One sheet more, its rows labelled on from the last one."""
+        """These sheets and one more. The labels of its rows continue those of the last sheet."""
         return Sheets((*self.sheets, (A, b)), self.rows + len(b)) if len(b) > 0 else self
 
     def in_use(self, label: Int[Tensor, "B F"]) -> tuple[Sheets, Int[Tensor, "B F"]]:
-        """Without the rows that are no facets, and the labels that the facets have then.
+        """The sheets without the rows that are no facets, and the new labels of the facets.
 
-        They are looked for only where there are more than twice as many rows as places for facets, and a sheet is
-        shortened only where half of it is not used: so it costs little, and a row goes through few tensors.
+        It is done only if there are more than twice as many rows as places for facets. A sheet is shortened only if
+        more than half of it is unused. So it costs little, and a row passes through few tensors.
         """
         if self.rows <= 2 * label.numel():
             return self, label
@@ -58,7 +59,7 @@ class Sheets:
         return Sheets(tuple(sheets), new - 1), torch.from_numpy(numbers[table]).to(label.device)
 
     def joined(self, other: Sheets, label: Int[Tensor, "B F"]) -> tuple[Sheets, Int[Tensor, "B F"]]:
-        """These sheets and those of `other`, and what its labels are then. A sheet of both is kept once."""
+        """These sheets and those of `other`, and the new labels of `other`. A sheet of both is kept once."""
         new = [sheet for sheet in other.sheets if not any(sheet is mine for mine in self.sheets)]
         sheets, first, next_label = (*self.sheets, *new), {}, 1
         for sheet in sheets:
@@ -73,11 +74,11 @@ class Sheets:
     def attached(
         self, A: Float[Tensor, "B F p"], b: Float[Tensor, "B F"], label: Int[Tensor, "B F"]
     ) -> tuple[Float[Tensor, "B F p"], Float[Tensor, "B F"]]:
-        """The facets' rows, numbers without gradients, with the gradients of the rows that they are labelled by."""
+        """The facets' rows A and b, with the gradients of the rows that their labels refer to."""
         if not self.sheets:
             return A, b
         of_A = torch.cat([A.new_zeros(1, A.shape[-1]), *(rows for rows, _ in self.sheets)])
         of_b = torch.cat([b.new_zeros(1), *(right for _, right in self.sheets)])
         of_A, of_b = (part.index_select(0, label.flatten()).unflatten(0, label.shape) for part in (of_A, of_b))
-        # Zeros with gradients are added: a facet that was moved outward keeps its place.
+        # Zeros with gradients are added. So a facet that was moved outward keeps its moved b.
         return A + (of_A - of_A.detach()), b + (of_b - of_b.detach())

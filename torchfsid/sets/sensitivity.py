@@ -1,7 +1,7 @@
 r"""Vertices, volume and centroid of polytopes as functions of their rows A z <= b, in the frame of each set.
 
 The numbers come from `shape`, the derivatives from `derivatives`. In the frame, z = middle + (y * scale) axes, a thin
-set is as wide as long; the map between z and y is constant, so that derivatives pass through it. Flat sets do not
+set is as wide as it is long. The map between z and y is constant, so that derivatives pass through it. Flat sets do not
 depend on the rows.
 """
 
@@ -25,7 +25,7 @@ from torchfsid.sets.shape import Shape
 def vertices(
     A: Float[Tensor, "B F p"], b: Float[Tensor, "B F"], corners: Float[Tensor, "B V p"], shape: Shape
 ) -> Float[Tensor, "B V p"]:
-    """The corners as functions of the rows; one that is not the solution of p facets does not depend on them."""
+    """The corners as functions of the rows. A corner that is not the solution of p facets is constant."""
     frame = _Frame.of(shape, A)
     rows, right = frame.rows(A, b)
     y, basis, solved = (torch.as_tensor(field, device=A.device) for field in (shape.y, *shape.bases))
@@ -37,7 +37,7 @@ def vertices(
 def measure(
     A: Float[Tensor, "B F p"], b: Float[Tensor, "B F"], shape: Shape
 ) -> tuple[Float[Tensor, "B"], Float[Tensor, "B p"]]:
-    """Volume and centroid."""
+    """Volume and centroid as functions of the rows."""
     frame, solid = _Frame.of(shape, A), shape.solid
     rows, right = frame.rows(A, b)
     found = (solid.y, *shape.solid_bases, *_padded(*shape.simplices, solid.y.shape[1], b.shape), ~shape.is_flat)
@@ -63,22 +63,23 @@ class _Frame(NamedTuple):
         return cls(*(torch.as_tensor(field, device=like.device) for field in shape.frame[:3]))
 
     def rows(self, A: Tensor, b: Tensor) -> tuple[Float[Tensor, "B F p"], Float[Tensor, "B F"]]:
-        """Rows for y, of the unit rows."""
+        """The rows A z <= b, of unit length, as rows over y."""
         unit = Halfspaces(A, b).normalised()
         return unit.A @ self.axes.mT * self.scale.unsqueeze(-2), unit.b - times(unit.A, self.middle)
 
     def outside(self, change: Float[Tensor, "B N p"]) -> Float[Tensor, "B N p"]:
-        """Changes of y as changes of z."""
+        """The changes of z that belong to changes of y."""
         return change * self.scale.unsqueeze(-2) @ self.axes
 
 
 def _change(value: Tensor) -> Tensor:
-    """Zero, with the derivatives of the value: numbers do not depend on whether a gradient is asked for."""
+    """Zero with the derivatives of `value`. So numbers do not depend on whether a gradient is asked for."""
     return value - value.detach()
 
 
 def _padded(corners: Indices, facet: Indices, V: int, rows: torch.Size) -> tuple[Indices, Indices]:
-    """Simplices of a batch in one list, as (B, S, p) and (B, S), numbered within each item; padding is a point."""
+    """A flat list of simplices as arrays (B, S, p) and (B, S), with vertices numbered within each item. Padding
+    simplices repeat one vertex."""
     B, F = rows
     item = facet // F
     number = np.bincount(item, minlength=B)

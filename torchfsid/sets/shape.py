@@ -1,7 +1,7 @@
-r"""The shape of polytopes, a batch at a time, in numpy: principal axes, volume, centroid, vertices' bases, simplices.
+r"""The shape of a batch of polytopes, in numpy: principal axes, volume, centroid, vertices' bases, simplices.
 
-It is computed in the frame of each set, z = middle + (y * scale) axes, the principal axes of its vertices, in which it
-is about as wide in every direction, however thin it is.
+It is computed in the frame of each set, z = middle + (y * scale) axes, with the principal axes of its vertices. In this
+frame even a thin set is about equally wide in every direction.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ touch leave a sliver which is no wider."""
 
 
 class Frame(NamedTuple):
-    """z = middle + (y * scale) axes; `flat` marks the directions in which the set is as thin as round-off."""
+    """The frame z = middle + (y * scale) axes. `flat` marks the directions in which the set is as thin as round-off."""
 
     middle: Reals
     axes: Reals
@@ -34,7 +34,7 @@ class Frame(NamedTuple):
 
     @classmethod
     def of(cls, vertices: Reals, real: Mask, reach: Reals) -> Frame:
-        """Of vertices (B, V, p), V >= p, those that are `real` (B, V); the others repeat the first one."""
+        """The frame of vertices (B, V, p), V >= p. The mask `real` is (B, V). Other vertices repeat the first one."""
         count, largest = real.sum(1)[:, None], reach.max(1, keepdims=True)
         middle = mean(vertices, count)
         _, scale, axes = np.linalg.svd(np.where(real[..., None], vertices - middle[:, None], 0.0), full_matrices=False)
@@ -50,14 +50,14 @@ class Frame(NamedTuple):
         return self.middle + ((y * self.scale)[:, None] @ self.axes)[:, 0]
 
     def rows(self, A: Reals, b: Reals) -> tuple[Reals, Reals]:
-        """Rows A z <= b as rows of y, of length 1; padding keeps its A = 0."""
+        """Rows A z <= b as rows over y, of length 1. Padding keeps A = 0."""
         unit, right = unit_rows(A, b)
         right = right - (unit @ self.middle[..., None])[..., 0]
         return unit_rows(unit @ (self.axes.swapaxes(1, 2) * self.scale[:, None]), right)
 
 
 class Solid(NamedTuple):
-    """In the frame: volume, centroid, and the vertices and incidences that they are computed from."""
+    """Volume and centroid in the frame, and the vertices and incidences that they are computed from."""
 
     volume: Reals
     centroid: Reals
@@ -67,13 +67,14 @@ class Solid(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """The shape of polytopes {z : A z <= b}; what follows from their facets and vertices is computed once.
+    """The shape of polytopes {z : A z <= b}. Each property is computed at most once.
 
     Attributes:
-        A, b: rows (B, F, p), (B, F).
+        A: (B, F, p), the facets' rows.
+        b: (B, F), their right-hand sides.
         vertices: (B, V, p), V >= p, padded by repeating the first one.
-        count: (B,), how many vertices are real.
-        incident: (B, V, F), which vertex is on which facet; padding is on none.
+        count: (B,), the number of real vertices.
+        incident: (B, V, F), which vertex is on which facet. Padding is on none.
         reach: (B, p), the largest |coordinates| that the set ever had.
     """
 
@@ -100,7 +101,7 @@ class Shape:
 
     @cached_property
     def rows(self) -> tuple[Reals, Reals]:
-        """Unit rows and right-hand sides, for y."""
+        """Unit rows and right-hand sides over y."""
         return self.frame.rows(self.A, self.b)
 
     @cached_property
@@ -110,12 +111,12 @@ class Shape:
 
     @cached_property
     def bases(self) -> tuple[Indices, Mask]:
-        """For each vertex p of its facets that it is the solution of, and whether there are so many."""
+        """For each vertex, p independent facets that meet in it, and whether there are p of them."""
         return bases(self.rows[0], self.incident)
 
     @cached_property
     def content(self) -> Reals:
-        """The volumes, also of flat sets, of which they are a multiple of round-off: to compare them by."""
+        """The volumes, for comparisons. Those of flat sets are not 0 but a multiple of round-off."""
         return self.solid.volume * self.frame.scale.prod(1)
 
     @cached_property
@@ -125,7 +126,7 @@ class Shape:
 
     @cached_property
     def centroid(self) -> Reals:
-        """The centroids; of a flat set, that of what it is in the directions in which it is not flat."""
+        """The centroids. That of a flat set is computed in the directions in which it is not flat."""
         centre = np.where(self.is_flat[:, None], 0.0, self.solid.centroid)
         for i in np.flatnonzero(self.is_flat):
             wide = ~self.frame.flat[i]
@@ -139,7 +140,7 @@ class Shape:
         noise = ROUND_OFF * self.reach.max(1, initial=0.0) / frame.scale.min(1, initial=np.inf)
         gap = np.linalg.norm((areas[:, None] @ rows)[:, 0], axis=1)
         for i in np.flatnonzero(~self.is_flat & (gap > (OPEN + noise) * areas.sum(1))):
-            # Between facets that are parallel to almost round-off, no vertex can tell which of them it is on. Then the
+            # If facets are parallel almost to round-off, the facet that a vertex lies on is not clear. Then the
             # incidences are taken from the hull of the polar dual, joggled so that no two facets are parallel.
             joggled = _joggled(rows[i], right[i])
             if joggled is None:
@@ -160,25 +161,26 @@ class Shape:
 
     @cached_property
     def simplices(self) -> tuple[Indices, Indices]:
-        """The facets of `solid`, taken apart (see `faces.simplices`); a flat set has none."""
+        """The facets of `solid` divided into simplices (see `faces.simplices`). A flat set has none."""
         return simplices(self.solid.incident & ~self.is_flat[:, None, None], self.A.shape[2])
 
 
 def mean(vertices: Reals, count: Indices) -> Reals:
-    """The mean of the vertices (B, V, p), of which `count` (B, 1) are real and the others repeat the first one."""
-    # About the first one: the mean of the coordinates of a thin set far from the origin may be outside.
+    """The mean of the vertices (B, V, p), of which `count` (B, 1) are real. The others repeat the first one."""
+    # It is taken relative to the first vertex: the mean of a thin set far from the origin could round to a point
+    # outside.
     first = vertices[:, 0]
     return first + (vertices - first[:, None]).sum(1) / count
 
 
 def unit_rows(A: Reals, b: Reals) -> tuple[Reals, Reals]:
-    """Rows of length 1; zero rows are left as they are."""
+    """The rows scaled to length 1. Zero rows are left unchanged."""
     norms = lengths(A)
     return A / norms[..., None], b / norms
 
 
 def lengths(A: Reals) -> Reals:
-    """Lengths of rows of any scale, with 1 for zero rows."""
+    """The lengths of rows of any scale. Zero rows give 1."""
     largest = np.abs(A).max(-1)
     largest = np.where(largest > 0, largest, 1.0)
     norms = np.linalg.norm(A / largest[..., None], axis=-1) * largest
@@ -186,9 +188,9 @@ def lengths(A: Reals) -> Reals:
 
 
 def _joggled(rows: Reals, right: Reals) -> tuple[Reals, Mask] | None:
-    """Vertices and incidences of {y : rows y <= right}, its rows joggled by about 1e-11: every vertex is on p facets.
+    """Vertices and incidences of {y : rows y <= right} after its rows are joggled by about 1e-11.
 
-    None if Qhull finds no bounded set.
+    Every vertex is then on exactly p facets. None if Qhull finds no bounded set.
     """
     real = np.flatnonzero((rows != 0).any(1))
     if not (right[real] > 0).all():
@@ -205,7 +207,7 @@ def _joggled(rows: Reals, right: Reals) -> tuple[Reals, Mask] | None:
 
 
 def _centre_of_hull(y: Reals) -> Reals:
-    """The centroid of the convex hull of points (V, k); if Qhull finds none, their mean."""
+    """The centroid of the convex hull of points (V, k). It is their mean if Qhull fails."""
     if y.shape[1] == 0:
         return np.zeros(0)
     if y.shape[1] == 1:
