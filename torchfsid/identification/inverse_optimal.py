@@ -54,8 +54,8 @@ def inverse_optimal_set(
         u: the measured control [m/s].
         C: of the nominal control C theta + d.
         d: of the nominal control C theta + d [m/s].
-        noise: `velocity` and `slack` are used. Errors of positions and neighbours are given by `row_errors` and
-        `drift`. row_errors: bounds on the errors of the rows; None if they are exact.
+        noise: `velocity` and `slack` are used. `row_errors` and `drift` cover errors of positions and neighbours.
+        row_errors: bounds on the errors of the rows; None if they are exact.
         drift: a bound on the error of C theta + d [m/s].
         saturation: how the nominal control is clipped; None if it is not.
         possible: points whose convex hull holds every C theta + d that is still possible [m/s]. Required with a

@@ -86,8 +86,8 @@ class SetMembershipObserver:
 
     Attributes:
         task: see `ObservationModel`.
-        feasible_set: Theta, batch (B,). It starts as the prior of every robot.
         barriers: see `ObservationModel`.
+        feasible_set: Theta, batch (B,). It starts as the prior of every robot.
         kind: see `ObservationModel`.
         noise: see `ObservationModel`.
         active_tolerance: see `ObservationModel`.
