@@ -160,3 +160,13 @@ def test_gradients_of_flat_sets_are_finite() -> None:
     for answer in asked:
         slopes = torch.autograd.grad(answer.sum(), (A, b, away), retain_graph=True, materialize_grads=True)
         assert all(slope.isfinite().all() for slope in slopes)
+
+
+@pytest.mark.parametrize("far", [1e6, 1e10, 1e160])
+def test_the_nearest_point_from_far_away(far: float):
+    """Squared distances to the candidates tie, or overflow."""
+    square = FeasibleSet.from_box(torch.tensor([-5.0, -5.0]), torch.tensor([5.0, 5.0]))
+    point = torch.tensor([far, 3.0], dtype=torch.float64, requires_grad=True)
+    nearest = square.project(point)
+    torch.testing.assert_close(nearest.detach(), torch.tensor([5.0, 3.0], dtype=torch.float64))
+    assert torch.autograd.grad(nearest.sum(), point)[0].tolist() == [0.0, 1.0]

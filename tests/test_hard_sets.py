@@ -223,3 +223,11 @@ def test_batches_of_any_shape(backend, batch):
     torch.testing.assert_close(ball.radius, alone.expand(batch), rtol=1e-8, atol=0)
     for metric in (None, torch.eye(2).double()):
         assert ProjectOnto(metric, backend)(halfspaces, outside).point.shape == (*batch, 2)
+
+
+@pytest.mark.parametrize("scale", [1e-8, 1e-4, 1.0, 1e4, 1e8])
+def test_a_contradiction_does_not_depend_on_the_scale_of_rows(scale: float):
+    rows = Halfspaces(
+        torch.tensor([[1.0, 0.0], [-1.0, 0.0]]) * scale, torch.tensor([1.0, -1.0 - 1e-10]).double() * scale
+    )
+    assert int(ProjectOnto()(rows, torch.tensor([16.0, 32.0])).status) == ProgrammeStatus.EMPTY

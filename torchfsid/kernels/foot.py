@@ -19,7 +19,7 @@ def foot_on(vertices, A, b, n, x, y, metric):
         inside = inside and A[i, 0] * x + A[i, 1] * y <= b[i]
     if inside:
         return x, y, -1, -1
-    least, foot_x, foot_y, first, second = np.inf, x, y, -1, -1
+    nearest, foot_x, foot_y, first, second = False, x, y, -1, -1
     for i in range(n):
         j = after_in(i, n)
         along_x, along_y = vertices[j, 0] - vertices[i, 0], vertices[j, 1] - vertices[i, 1]
@@ -28,11 +28,14 @@ def foot_on(vertices, A, b, n, x, y, metric):
         q = metric[1, 0] * along_x + metric[1, 1] * along_y
         squared = p * along_x + q * along_y
         share = min(max(-(p * away_x + q * away_y) / squared, 0.0), 1.0) if squared > 0 else 0.0
-        away_x += share * along_x
-        away_y += share * along_y
-        distance = metric[0, 0] * away_x * away_x + 2 * metric[0, 1] * away_x * away_y + metric[1, 1] * away_y * away_y
-        if distance < least:
-            least, foot_x, foot_y = distance, vertices[i, 0] + share * along_x, vertices[i, 1] + share * along_y
+        new_x, new_y = vertices[i, 0] + share * along_x, vertices[i, 1] + share * along_y
+        # |f - z|^2 - |g - z|^2 = (f - g)'H(f - z + g - z): squares of far distances would tie, or overflow.
+        step_x, step_y = new_x - foot_x, new_y - foot_y
+        both_x, both_y = (new_x - x) + (foot_x - x), (new_y - y) + (foot_y - y)
+        p = metric[0, 0] * step_x + metric[0, 1] * step_y
+        q = metric[1, 0] * step_x + metric[1, 1] * step_y
+        if not nearest or p * both_x + q * both_y < 0:
+            nearest, foot_x, foot_y = True, new_x, new_y
             first = before_in(i, n) if share <= 0 else i
             second = -1 if 0 < share < 1 else i if share <= 0 else j
     return foot_x, foot_y, first, second

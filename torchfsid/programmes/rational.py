@@ -27,7 +27,8 @@ def nearest_point(A: Array, b: Array, y: Array, H: Array, z: Array, mu: Array, r
     Returns:
         Its `ProgrammeStatus`.
     """
-    m, p = A.shape
+    scale, (m, p) = powers_of_two(A), A.shape
+    A, b = A * scale[:, None], b * scale
     unit, offsets, sizes, lengths, L = np.empty((m, p)), np.empty(m), np.empty(m), np.empty((m, 2)), np.zeros((p, p))
     metric = len(H) > 0 and cholesky(H[0], L)
     to_frame(A, b, y, L, metric, unit, offsets, sizes, lengths)
@@ -45,6 +46,7 @@ def nearest_point(A: Array, b: Array, y: Array, H: Array, z: Array, mu: Array, r
         status = kernel.finish_nearest(
             A, b, y, L, metric, unit, sizes, lengths, rows, k, *scratch, x.astype(float), z, mu
         )
+    mu[:k] *= scale[rows[:k]]
     if status != kernel.OK:
         z[:], mu[:], rows[:], filled[:] = np.nan, 0.0, 0, False
     return status
@@ -56,7 +58,8 @@ def inscribed_ball(A: Array, b: Array, simplex: Array, centre: Array, rows: Arra
     Returns:
         The radius and the `ProgrammeStatus`.
     """
-    (m, p), n = A.shape, A.shape[1] + 1
+    scale, (m, p), n = powers_of_two(A), A.shape, A.shape[1] + 1
+    A, b = A * scale[:, None], b * scale
     unit, offsets, sizes, lengths = np.ones((m, n)), np.empty(m), np.empty(m), np.empty((m, 2))
     to_frame(A, b, np.zeros(p), np.zeros((p, p)), False, unit[:, :p], offsets, sizes, lengths)
     real = np.flatnonzero(offsets < np.inf)
@@ -74,6 +77,12 @@ def inscribed_ball(A: Array, b: Array, simplex: Array, centre: Array, rows: Arra
         scratch = [np.zeros(shape) for shape in ((n, n), (n, n), n, (n, n), (6, n))]
         status = kernel.finish_ball(unit, offsets, simplex, rows, inverse, w, far, *scratch)
     return kernel.write_ball(w, m, status, centre, rows)
+
+
+def powers_of_two(A: Array) -> Array:
+    """For each row the power of two that brings its largest entry into [1/2, 1): round-off is judged at that length."""
+    _, exponent = np.frexp(np.abs(A).max(-1))
+    return np.ldexp(1.0, np.clip(-exponent, -1000, 1000))
 
 
 def fractions(values: Array) -> Array:
