@@ -227,7 +227,7 @@ def test_batches_of_any_shape(backend, batch):
 
 @pytest.mark.parametrize("scale", [1e-8, 1e-4, 1.0, 1e4, 1e8])
 def test_a_contradiction_does_not_depend_on_the_scale_of_rows(scale: float):
-    rows = Halfspaces(
-        torch.tensor([[1.0, 0.0], [-1.0, 0.0]]) * scale, torch.tensor([1.0, -1.0 - 1e-10]).double() * scale
-    )
-    assert int(ProjectOnto()(rows, torch.tensor([16.0, 32.0])).status) == ProgrammeStatus.EMPTY
+    A = torch.tensor([[1.0, 0.0], [-1.0, 0.0]], dtype=torch.float64)
+    b = torch.tensor([1.0, -1.0 - 1e-10], dtype=torch.float64)
+    found = ProjectOnto()(Halfspaces(A * scale, b * scale), torch.tensor([16.0, 32.0]))
+    assert int(found.status) == ProgrammeStatus.EMPTY
