@@ -15,7 +15,7 @@ from torchfsid.commands.results_folder import OBSERVE, ResultsFolder
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code."""
+    """Run the command line and return the exit code (`commands.command_line` lists them)."""
     parser = Parser(
         prog="torchfsid", description="For each robot, the set in which its hidden task parameter must lie."
     )

@@ -1,3 +1,4 @@
-"""YAML files as validated, frozen records, and the objects of the package that they stand for. No torch before
-something is built.
+"""Configuration files in YAML: validated, frozen records that build the objects of the package.
+
+PyTorch is imported only when something is built.
 """

@@ -1,4 +1,4 @@
-"""Where the bodies are in a ROS 2 bag: the section `bag` of an observe file."""
+"""The section `bag` of an observe file: where the bodies are in a ROS 2 bag."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from torchfsid.config.quantities import BodyName, NonNegative, Positive
 
 
 class BagConfig(Strict):
-    """Where in a bag the bodies are, in the order in which the log has them.
+    """The bodies of a bag, in the order in which the log has them.
 
     Attributes:
-        topics: bodies by the topic of their Odometry or PoseStamped.
-        frames: bodies by the child frame of their transform on /tf.
-        rate: [Hz], of the clock onto which bodies are brought whose stamps differ, best the controllers' rate; default:
-            the stamps of the first body. Stamps that are the same for all bodies are a clock already.
-        radius: of every body [m].
+        topics: topic of an Odometry or PoseStamped, to the name of the body.
+        frames: child frame of a transform on /tf, to the name of the body.
+        rate: rate [Hz] of the common clock, best the controllers' rate. It is used only if the bodies' stamps differ.
+            Default: the stamps of the first body.
+        radius: radius of every body [m].
     """
 
     topics: dict[str, BodyName] = Field(default_factory=dict)
@@ -28,7 +28,7 @@ class BagConfig(Strict):
 
     @property
     def origins(self) -> list[tuple[str, str]]:
-        """Where each body's samples come from, in words, and the body."""
+        """Pairs of a topic or frame, described in words, and its body."""
         topics = [(f"topic {topic!r}", body) for topic, body in self.topics.items()]
         return topics + [(f"frame {frame!r}", body) for frame, body in self.frames.items()]
 

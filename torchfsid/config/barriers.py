@@ -1,6 +1,6 @@
-"""The barriers in configuration files, and the objects of `robots.barriers` that they stand for.
+"""The barriers in configuration files. Each builds an object of `robots.barriers`.
 
-Each answers for itself what a log must hold for it: the bodies' radii, their velocities now or one sample earlier.
+Each barrier says what it needs from a log: the bodies' radii, and their velocities now or one sample earlier.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class ClassKConfig(Strict):
-    """`ClassK`: gain sign(h) |h|^power."""
+    """`ClassK`: alpha(h) = gain sign(h) |h|^power."""
 
     gain: Positive
     power: Positive = 1.0
@@ -39,11 +39,15 @@ class ClassKConfig(Strict):
 
 
 class AvoidanceConfig(Strict):
-    """`CollisionAvoidance`, with `safety_distance` [m] or, when the radii are known, a `margin` [m] beyond them.
+    """`CollisionAvoidance`, by `safety_distance`, or by `margin` if the log has radii. Exactly one of the two is given.
 
     Attributes:
-        safety_distances: bodies that have a distance of their own [m].
-        neighbour_velocity: which velocities of other bodies the rows depend on.
+        distance: form of h, see `robots.barriers`.
+        safety_distance: distance between centres [m].
+        safety_distances: distances to single bodies that replace `safety_distance` [m].
+        margin: distance between the discs of two bodies [m].
+        class_k: the function alpha of the barrier.
+        neighbour_velocity: which velocities of other bodies the rows use.
         soft: the controller may violate the rows.
     """
 
@@ -68,16 +72,26 @@ class AvoidanceConfig(Strict):
 
     @property
     def uses_radius(self) -> bool:
+        """Do the rows need the bodies' radii?"""
         return self.margin is not None
 
     def require_radii(self, radius: Sequence[float] | None) -> None:
-        """Raises `ConfigError` if the rows need radii that the log does not have."""
+        """Check that the log has the radii that the rows need [m].
+
+        Raises:
+            ConfigError: radii are missing, or are zero with a margin of zero.
+        """
         if self.margin is not None and radius is None:
             raise ConfigError("barriers: a margin needs the radii, but the log has none (column radius, bag.radius)")
         if self.margin is not None and radius is not None and self.margin + min(radius) <= 0:
             raise ConfigError("barriers: a margin of 0 needs positive radii")
 
     def build(self, bodies: Sequence[str]) -> Barrier:
+        """The barrier among these bodies.
+
+        Raises:
+            ConfigError: `safety_distances` names a body that is not there.
+        """
         import torch
 
         from torchfsid.robots.barriers import CollisionAvoidance
@@ -93,7 +107,7 @@ class AvoidanceConfig(Strict):
 
 
 class _RobotsOwn(Strict):
-    """Rows that do not depend on other bodies."""
+    """A barrier whose rows do not depend on other bodies."""
 
     @property
     def uses_radius(self) -> bool:
@@ -135,7 +149,7 @@ class SpeedPolygonConfig(_RobotsOwn):
 
 
 class ArenaConfig(_RobotsOwn):
-    """`Arena`: walls around a box [m], kept at a distance `margin` [m]."""
+    """`Arena`: keep a distance `margin` [m] from the walls of a box [m]."""
 
     kind: Literal["arena"] = "arena"
     lower: PlanarVector

@@ -1,6 +1,7 @@
 """YAML files to validated, frozen records and back.
 
-A mistake in a file is one `ConfigError` of one line: the file, the path of the key, what was expected, what came.
+A mistake in a file is one `ConfigError` of one line. It names the file, the path of the key, what was expected and what
+was found.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ from torchfsid.errors import ConfigError, one_line
 
 
 def wrong(message: str, key: object = None) -> PydanticCustomError:
-    """An error whose message is complete; `key` is the part of the section that it is about."""
+    """A validation error with its whole message. `key` is the part of the section that the message is about."""
     return PydanticCustomError("complete", "{message}", {"message": message, "key": key})
 
 
 class Strict(BaseModel):
-    """A section of a file: frozen, and a key that it does not know is an error with a guess at what was meant."""
+    """A section of a file. It is frozen. An unknown key is an error that suggests the nearest known key."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -47,26 +48,35 @@ CHOICES = frozenset({"<section>", "<false>"})
 
 
 def load(path: str | Path, model: type[Config], overrides: Iterable[str] = ()) -> Config:
-    """The file at `path`, after `overrides` such as "noise.velocity=0.02", as a `model`.
+    """Read a configuration file.
+
+    Args:
+        path: the YAML file.
+        overrides: texts such as "noise.velocity=0.02", applied before validation (`apply_overrides`).
+        model: the class of the configuration.
 
     Raises:
-        ConfigError: the file cannot be read, is not YAML, or is not what `model` expects.
+        ConfigError: the file cannot be read, is not YAML, or does not fit `model`.
     """
     return validate(apply_overrides(read_yaml(path), overrides), model, source=str(path))
 
 
 def dump(config: Strict) -> str:
-    """The configuration with its defaults filled in, as YAML that loads back to the same configuration."""
+    """The configuration as YAML, with defaults filled in. `load` gives back the same configuration."""
     return to_yaml(config.model_dump(mode="json", exclude_none=True))
 
 
 def to_yaml(content: Mapping[str, Any]) -> str:
-    """Keys and values as YAML, in their order."""
+    """The mapping as YAML, its keys in their order."""
     return yaml.safe_dump(dict(content), sort_keys=False, default_flow_style=None)
 
 
 def read_yaml(path: str | Path) -> dict[Any, Any]:
-    """The mapping in a YAML file, not yet validated. Raises `ConfigError`."""
+    """The mapping in a YAML file, not yet validated.
+
+    Raises:
+        ConfigError: the file cannot be read, is not YAML, or holds no mapping.
+    """
     try:
         text = Path(path).read_bytes()
     except (OSError, ValueError) as error:
@@ -79,9 +89,16 @@ def read_yaml(path: str | Path) -> dict[Any, Any]:
 
 
 def apply_overrides(mapping: dict[Any, Any], overrides: Iterable[str]) -> dict[Any, Any]:
-    """A copy of a raw mapping with values replaced: "a.b=value", "barriers.0.margin=0.2"; values are YAML.
+    """A copy of a raw mapping with some values replaced.
 
-    Keys that do not exist are added, and left to the validation. Raises `ConfigError` for what is not such a text.
+    Keys that do not exist are added. Validation comes later.
+
+    Args:
+        mapping: as `read_yaml` returns it.
+        overrides: texts such as "a.b=value" or "barriers.0.margin=0.2". Values are YAML.
+
+    Raises:
+        ConfigError: an override is not of this form, or its path leads through something that has no keys.
     """
     for override in overrides:
         path, equals, text = override.partition("=")
@@ -94,7 +111,10 @@ def apply_overrides(mapping: dict[Any, Any], overrides: Iterable[str]) -> dict[A
 
 
 def _replaced(node: Any, keys: list[str], value: object, where: str) -> Any:
-    """`node` with the value at `keys`, copied along the way: aliases share nodes that must not change together."""
+    """A copy of `node` with the value at `keys` replaced.
+
+    Every node on the way is copied, because YAML aliases share nodes that must not change together.
+    """
     if not keys:
         return value
     first, *rest = keys
@@ -110,7 +130,11 @@ def _replaced(node: Any, keys: list[str], value: object, where: str) -> Any:
 
 
 def validate(mapping: Mapping[Any, Any], model: type[Config], source: str) -> Config:
-    """The mapping as a `model`. Raises `ConfigError`, which names the `source` and the path of the first mistake."""
+    """The mapping as a `model`.
+
+    Raises:
+        ConfigError: the mapping does not fit. The message names `source` and the path of the first mistake.
+    """
     try:
         return model.model_validate(mapping)
     except ValidationError as error:
@@ -120,7 +144,10 @@ def validate(mapping: Mapping[Any, Any], model: type[Config], source: str) -> Co
 
 
 def _path(error: ErrorDetails, mapping: Mapping[Any, Any]) -> str:
-    """`barriers[0].safety_distance`. Pydantic also names kinds and tags of sections, which are no keys."""
+    """The path of a mistake, such as `barriers[0].safety_distance`.
+
+    Pydantic also puts kinds and tags of sections into its paths. They are not keys and are left out.
+    """
     keys: list[Any] = []
     node: Any = mapping
     kind = None
@@ -167,8 +194,11 @@ def _sentence(error: ErrorDetails) -> str:
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML as `safe_load` reads it, except that a key may not be given twice, and that only plain decimal notation
-    makes a number: the body called 010 is not number 8, and neither 1_0 nor 1_0.0 is ten."""
+    """YAML as `safe_load` reads it, with two differences.
+
+    A key that is given twice is an error. Only plain decimal notation is a number: the body 010 is not number 8, and
+    neither 1_0 nor 1_0.0 is ten.
+    """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
         seen = set()
@@ -197,6 +227,6 @@ def _parse(text: str | bytes, source: str) -> Any:
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
         raise ConfigError(f"{source}: {line}not valid YAML: {one_line(error.problem or error)}") from error
-    # PyYAML also lets the errors of Python's own constructors through (!!int x, 2001-99-99, very deep nesting ...).
+    # PyYAML also passes on errors of Python's own constructors (!!int x, 2001-99-99, very deep nesting ...).
     except (yaml.YAMLError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise ConfigError(f"{source}: not valid YAML: {one_line(error)}") from error

@@ -1,12 +1,12 @@
-"""The declared models of an observe file: one, or several that compete for the same log.
+"""The declared models of an observe file: one model, or several hypotheses for the same log.
 
     task:  {kind: goal, gain: 0.9}                    one model, or
     tasks:                                            hypotheses, each with a name, a task and, if need be, a prior
       - {name: goal, task: {kind: goal, gain: 0.9}}
       - {task: {kind: velocity}, prior: {lower: [-1, -1], upper: [1, 1]}}
 
-A hypothesis without a name is called by the kind of its task; one without a prior takes that of the file. Everything
-else in the file holds for all of them.
+A hypothesis without a name has the name of its task's kind. A hypothesis without a prior has the prior of the file. All
+other sections hold for every hypothesis.
 """
 
 from __future__ import annotations
@@ -24,7 +24,13 @@ from torchfsid.errors import ConfigError
 
 
 class HypothesisConfig(Strict):
-    """A task that the robots may have; `name` becomes the name of a folder."""
+    """A task that the robots may have.
+
+    Attributes:
+        name: name of the hypothesis and of its folder. Default: the kind of the task.
+        task: the task.
+        prior: prior set of its theta. Default: the prior of the file.
+    """
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")] | None = None
     task: TaskConfig
@@ -32,6 +38,7 @@ class HypothesisConfig(Strict):
 
     @property
     def called(self) -> str:
+        """The name, or the kind of the task if there is no name."""
         return self.name or self.task.kind
 
 
@@ -48,10 +55,15 @@ class _Hypotheses(Strict):
 
 
 def load_models(path: str | Path, overrides: Iterable[str] = ()) -> dict[str, ObserveConfig]:
-    """The models in the file at `path`, by name, after `overrides`; the only model of a `task` is called "".
+    """The models in an observe file, by name. The only model of a `task` has the name "".
+
+    Args:
+        path: the YAML file.
+        overrides: as in `load`.
 
     Raises:
-        ConfigError: see `load`; or the file has both `task` and `tasks`, or resets sets that are there to be refuted.
+        ConfigError: see `load`. Also if the file has both `task` and `tasks`, or if it has `tasks` and
+            `on_inconsistent` is not `hold`: an empty set refutes a hypothesis, and must not be reset.
     """
     mapping = apply_overrides(read_yaml(path), overrides)
     source = str(path)
@@ -71,7 +83,7 @@ def load_models(path: str | Path, overrides: Iterable[str] = ()) -> dict[str, Ob
 
 
 def dump_models(models: Mapping[str, ObserveConfig]) -> str:
-    """The file that `load_models` reads back as these models, with defaults filled in."""
+    """The models as one YAML file, with defaults filled in. `load_models` gives back the same models."""
     first = next(iter(models.values()))
     if len(models) == 1:
         return dump(first)

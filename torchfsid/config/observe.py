@@ -1,7 +1,7 @@
-"""The file of `torchfsid observe` and `torchfsid check`, with the objects of the package that it stands for.
+"""The configuration file of `torchfsid observe` and `torchfsid check`.
 
-Nothing here imports torch before something is built, so that a wrong file is refused at once. The sections have files
-of their own, from which other files are made too: `tasks`, `barriers`, `observers`.
+PyTorch is imported only when something is built, so that a wrong file is refused at once. The sections are in modules
+of their own (`tasks`, `barriers`, `observers`), because other files use them too.
 """
 
 from __future__ import annotations
@@ -37,16 +37,22 @@ OptionalUkfConfig = Annotated[
 
 
 class ObserveConfig(Strict):
-    """The file of `torchfsid observe`.
+    """The file of `torchfsid observe`: the declared model, the prior and the bounds on errors.
 
     Attributes:
-        set: the set that is intersected over time.
-        active_tolerance: distance [m/s] to its boundary below which a row counts as active (G., Eqs. (11), (12), (17)).
-        velocity: take velocities from the log, or from differences of its positions.
+        task: the task, whose parameter theta is inferred.
+        barriers: the barriers, in the order of their rows.
+        prior: the prior set of theta.
+        noise: bounds on the errors of the log.
+        set: which set is intersected over time.
+        active_tolerance: distance of the control from a row's boundary below which the row counts as active [m/s] (G.,
+            Eqs. (11), (12), (17)).
+        velocity: take velocities from the log (`logged`), or from differences of its positions (`differentiated`).
         obstacles: bodies of the log that are avoided but not inferred.
-        on_inconsistent: what an empty intersection does to a set: `hold` it, `reset` it to the prior, or `raise`.
-        bag: where in a ROS bag the bodies are; logs of other kinds do not look at it.
-        ukf: the filter that runs beside the sets; False: none.
+        on_inconsistent: what happens to a set when the intersection is empty: `hold` keeps it, `reset` starts again
+            from the prior, `raise` ends the command.
+        bag: where the bodies are in a ROS bag. Other logs ignore it.
+        ukf: the unscented Kalman filter that runs beside the sets, or False for none.
     """
 
     task: TaskConfig
@@ -73,21 +79,21 @@ class ObserveConfig(Strict):
         return self
 
     def with_velocity_bound(self, bound: float) -> ObserveConfig:
-        """The configuration with another `noise.velocity` [m/s]."""
+        """The same configuration with `noise.velocity` = `bound` [m/s]."""
         return self.model_copy(update={"noise": self.noise.model_copy(update={"velocity": bound})})
 
     @property
     def neighbour_velocities(self) -> frozenset[str]:
-        """Which velocities of the bodies the barriers use: some of `current`, `previous`."""
+        """Which velocities of other bodies the barriers use: `current`, `previous`, both or none."""
         return frozenset(barrier.neighbour_velocity for barrier in self.barriers) - {"none"}
 
     @property
     def required(self) -> tuple[str, ...]:
-        """The bodies without which a measurement says nothing about theta: the leader of a formation."""
+        """The bodies without which a measurement says nothing about theta, such as the leader of a formation."""
         return self.task.required
 
     def robots(self, bodies: Sequence[str]) -> list[str]:
-        """The bodies to infer: all but the obstacles and a formation's leader, who keeps no offset to itself.
+        """The bodies to infer: all but the obstacles and the leader of a formation, who has no offset to itself.
 
         Raises:
             ConfigError: the file names a body that is not there, or no robot is left.
@@ -102,10 +108,10 @@ class ObserveConfig(Strict):
     def build_observer(
         self, task: Task, barriers: Sequence[Barrier], robots: int
     ) -> SetMembershipObserver | HybridObserver:
-        """What observes so many robots: sets, with the filter beside them unless it is left out.
+        """The observer of this number of robots: sets, with the filter beside them unless `ukf` is False.
 
         Raises:
-            ConfigError: the velocity bound is `auto`, and nobody has found it yet.
+            ConfigError: `noise.velocity` is `auto`, and the bound has not been determined yet.
         """
         from torchfsid.observers.hybrid import HybridObserver
         from torchfsid.observers.set_membership import SetMembershipObserver

@@ -1,4 +1,4 @@
-"""What the observers start from and how they run: prior, noise bounds, filter, as configuration files say it."""
+"""Prior, bounds on errors and filter, as configuration files give them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FARTHEST = 1e100
 
 
 class PriorConfig(Strict):
-    """The prior set of theta, a box in theta's units."""
+    """The prior set of theta: a box, in the units of theta."""
 
     lower: Vector
     upper: Vector
@@ -44,13 +44,13 @@ class PriorConfig(Strict):
         return self
 
     def build(self, robots: int) -> FeasibleSet:
-        """The prior set of each robot."""
+        """The prior set, once for each robot."""
         from torchfsid.sets.feasible_set import FeasibleSet
 
         return FeasibleSet.from_box(*self.corners(robots))
 
     def corners(self, robots: int) -> tuple[Float[Tensor, "robots p"], Float[Tensor, "robots p"]]:
-        """Its lower and its upper corner, for each robot."""
+        """The lower and the upper corner of the prior, once for each robot."""
         import torch
 
         lower, upper = torch.tensor([self.lower, self.upper], dtype=torch.float64)
@@ -64,18 +64,26 @@ class _Errors(Strict):
 
 
 class NoiseConfig(_Errors):
-    """`NoiseBound`: bounds on errors of controls and slacks [m/s], positions [m], other bodies' velocities [m/s]."""
+    """`NoiseBound`: bounds on the errors of a log.
+
+    Attributes:
+        velocity: bound on the error of controls [m/s].
+        slack: bound on the error of slacks [m/s].
+        position: bound on the error of positions [m].
+        neighbour_velocity: bound on the error of other bodies' velocities [m/s].
+    """
 
     velocity: NonNegative
 
     def build(self) -> NoiseBound:
+        """The `NoiseBound` with these bounds."""
         from torchfsid.robots.bounds import NoiseBound
 
         return NoiseBound(self.velocity, self.slack, self.position, self.neighbour_velocity)
 
 
 class ObservedNoiseConfig(_Errors):
-    """`NoiseConfig` for a log, which may itself say how large the errors in it must be: `velocity: auto`."""
+    """`NoiseConfig` for a log. With `velocity: auto` the bound is determined from the log itself."""
 
     velocity: float | Literal["auto"]
 
@@ -90,21 +98,25 @@ class ObservedNoiseConfig(_Errors):
         return float(bound)
 
     def build(self) -> NoiseBound:
-        """Raises `ConfigError` for `auto`: someone has to find the bound first."""
+        """The `NoiseBound` with these bounds.
+
+        Raises:
+            ConfigError: `velocity` is `auto`. Determine the bound first, and use `ObserveConfig.with_velocity_bound`.
+        """
         if self.velocity == "auto":
             raise ConfigError("noise.velocity: expected a number, got 'auto'")
         return NoiseConfig(**self.model_dump()).build()
 
 
 class UkfConfig(Strict):
-    """The unscented Kalman filter on [x; theta], and how the hybrid observer joins it with the set.
+    """The unscented Kalman filter on [x; theta], and how the hybrid observer combines it with the set.
 
     Attributes:
-        position_noise: standard deviation of a measured position [m]; R is its square.
+        position_noise: standard deviation of a measured position [m]. R is its square.
         process_noise: standard deviation of theta's drift in one second [units of theta].
-        prior_std: standard deviation of theta at the start; None: that of the prior box.
-        qp_inside: the QP is solved inside the filter's dynamics; otherwise the measurement says which rows are active.
-        feedback: the hybrid's projected estimate replaces the filter's own.
+        prior_std: standard deviation of theta at the start. Default: that of a uniform distribution over the prior.
+        qp_inside: solve the QP inside the filter's dynamics. Otherwise the measurement determines the active rows.
+        feedback: the filter goes on from the hybrid observer's projected estimate instead of its own.
     """
 
     position_noise: Positive = 1e-3
@@ -114,7 +126,7 @@ class UkfConfig(Strict):
     feedback: Flag = False
 
     def spread(self, prior: PriorConfig) -> tuple[float, ...]:
-        """Standard deviations of theta at the start: those of a uniform distribution over the prior, unless given."""
+        """Standard deviations of theta at the start, one per entry of theta."""
         if self.prior_std is not None:
             return (self.prior_std,) * len(prior.lower)
         return tuple((high - low) / math.sqrt(12) for low, high in zip(prior.lower, prior.upper, strict=True))
@@ -122,7 +134,7 @@ class UkfConfig(Strict):
     def build(
         self, task: Task, barriers: Sequence[Barrier], prior: PriorConfig, robots: int, active_tolerance: float
     ) -> ParameterUkf:
-        """The filter of so many robots, which starts from the centre of the prior."""
+        """The filter of this number of robots. It starts from the centre of the prior."""
         import torch
 
         from torchfsid.observers.ukf import ParameterUkf

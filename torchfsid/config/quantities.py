@@ -1,4 +1,4 @@
-"""The quantities that configuration files are made of: what is a number, a name, a vector there."""
+"""The types of values in configuration files: numbers, names and vectors."""
 
 from __future__ import annotations
 
@@ -17,12 +17,15 @@ DECIMAL = re.compile(r"\s*[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?\s*",
 
 
 def as_number(value: object) -> object:
-    """PyYAML takes 1e-6, a number without a dot, for text. What only Python reads as a number, like 1_0, stays text."""
+    """A number that PyYAML reads as text, such as 1e-6 without a dot. Other texts are returned as they are.
+
+    Texts that only Python reads as numbers, such as 1_0, stay texts.
+    """
     return float(value) if isinstance(value, str) and DECIMAL.fullmatch(value) else value
 
 
 def _name(value: object) -> object:
-    """Bodies are named by text; a whole number stands for the text that writes it."""
+    """The name of a body. A whole number becomes the text that writes it."""
     if isinstance(value, int) and not isinstance(value, bool):
         return str(value)
     if not isinstance(value, str) or not value:
@@ -42,12 +45,22 @@ PlanarVector = Annotated[tuple[Number, ...], Field(min_length=2, max_length=2)]
 
 
 def require_body(path: str, name: str, bodies: Sequence[str]) -> None:
-    """Raises `ConfigError` if the file names, at `path`, a body that is not there."""
+    """Check that a body named in the file is in the log.
+
+    Args:
+        path: path of the key that names it.
+        name: the name.
+        bodies: the bodies of the log.
+
+    Raises:
+        ConfigError: there is no such body.
+    """
     if name not in bodies:
         raise ConfigError(f"{path}: no body is called {name!r}; there are {reprlib.repr(list(bodies))}")
 
 
 def require_box(lower: Sequence[float], upper: Sequence[float]) -> None:
+    """Check, in a validator, that lower < upper in every entry."""
     if len(lower) != len(upper):
         raise wrong(f"lower has {len(lower)} entries, upper has {len(upper)}")
     for i, (low, high) in enumerate(zip(lower, upper, strict=True)):

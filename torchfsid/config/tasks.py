@@ -1,4 +1,4 @@
-"""The tasks in configuration files, and the objects of `tasks` that they stand for."""
+"""The tasks in configuration files. Each builds an object of `robots.tasks`."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 
 class NormSaturationConfig(Strict):
-    """|uhat| <= limit [m/s]."""
+    """Norm saturation: |uhat| <= limit [m/s]."""
 
     kind: Literal["norm"] = "norm"
     limit: Positive
 
 
 class BoxSaturationConfig(Strict):
-    """|uhat_i| <= limit_i [m/s]."""
+    """Box saturation: |uhat_i| <= limit_i [m/s] on each axis."""
 
     kind: Literal["box"] = "box"
     limit: PlanarVector
@@ -46,7 +46,7 @@ class _Task(Strict):
 
     @property
     def is_clipped(self) -> bool:
-        """Is the nominal control other than C theta + d somewhere?"""
+        """Does the nominal control differ from C theta + d somewhere?"""
         return False
 
     @property
@@ -56,7 +56,13 @@ class _Task(Strict):
 
 
 class GoalConfig(_Task):
-    """`GoalTask`: go to a goal with a known gain [1/s]; clipped; not at all within `dead_zone` of it [m]."""
+    """`GoalTask`: go to a goal with a known gain.
+
+    Attributes:
+        gain: gain of the nominal control [1/s].
+        saturation: how the nominal control is clipped. Default: not at all.
+        dead_zone: distance from the goal within which the nominal control is zero [m].
+    """
 
     kind: Literal["goal"] = "goal"
     gain: Positive
@@ -116,7 +122,7 @@ class VelocityConfig(_Task):
 
 
 class FormationConfig(_Task):
-    """`FormationTask`: keep an offset to the body named `leader`, with a known gain [1/s]."""
+    """`FormationTask`: keep an offset to the body `leader`, with a known gain [1/s]."""
 
     kind: Literal["formation"] = "formation"
     gain: Positive
@@ -134,7 +140,7 @@ class FormationConfig(_Task):
 
 
 class OrbitConfig(_Task):
-    """`OrbitTask`: circle a centre at a known rate [rad/s], positive anticlockwise."""
+    """`OrbitTask`: circle a centre at a known rate [rad/s], positive if anticlockwise."""
 
     kind: Literal["orbit"] = "orbit"
     rate: Number
@@ -146,7 +152,13 @@ class OrbitConfig(_Task):
 
 
 class PatrolConfig(_Task):
-    """`PatrolTask`: follow a closed path of some harmonics of a known rate [rad/s], with a known gain [1/s]."""
+    """`PatrolTask`: follow a closed path.
+
+    Attributes:
+        gain: gain of the nominal control [1/s].
+        rate: angular rate of the first harmonic [rad/s].
+        harmonics: number of harmonics of the path.
+    """
 
     kind: Literal["patrol"] = "patrol"
     gain: Positive

@@ -1,1 +1,1 @@
-"""Logs that somebody recorded, from CSV, Parquet and ROS bags, as measurements."""
+"""Recorded logs from CSV, Parquet and ROS bags, read as measurements."""

@@ -1,8 +1,8 @@
-"""ROS 2 bags (sqlite3 or MCAP, zstd-compressed or not) as logs; ROS itself is not needed, only the extra `ros`.
+"""ROS 2 bags (sqlite3 or MCAP, with or without zstd) as logs. The extra `ros` is needed, ROS itself is not.
 
-A body is measured by a topic, nav_msgs/Odometry or geometry_msgs/PoseStamped, or by a transform on /tf. Times are the
-stamps of the headers, never those of reception. All positions must be given in one frame. The twist of an Odometry is
-in its child frame: the pose's orientation turns it into the frame of the positions, unless both frames are the same.
+A body is measured by a topic (nav_msgs/Odometry or geometry_msgs/PoseStamped) or by a transform on /tf. Times are the
+stamps of the headers, not the times of reception. All positions must be in one frame. The twist of an Odometry is in
+its child frame. The orientation of the pose turns it into the frame of the positions, unless both frames are the same.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ MAX_TIMES = 1_000_000
 def read_bag(path: str | Path, bag: BagConfig) -> Log:
     """The log in a bag: a folder with metadata.yaml, or a single .mcap or .db3 file.
 
-    Bodies whose stamps differ are brought onto one clock, with bounds on the error (`resampling`).
+    Bodies whose stamps differ are resampled onto one clock, with bounds on the errors (`resampling`).
 
     Raises:
         LogError: the file cannot be read, or is not such a bag.
-        ConfigError: `bag` names what is not in the bag, or what is of another type.
+        ConfigError: `bag` names a topic or frame that is not in the bag, or a topic of another type.
     """
     source = str(path)
     samples = _read(Path(path), bag)
@@ -54,7 +54,14 @@ def read_bag(path: str | Path, bag: BagConfig) -> Log:
 
 
 class _Sample(NamedTuple):
-    """What a message says about a body, in the frame of its header; stamp in [ns]."""
+    """What one message says about a body.
+
+    Attributes:
+        stamp: time of the header [ns].
+        frame: frame of the header.
+        x: position [m].
+        u: velocity in the same frame [m/s], or None.
+    """
 
     stamp: int
     frame: str
@@ -63,13 +70,13 @@ class _Sample(NamedTuple):
 
 
 def _read(path: Path, bag: BagConfig) -> dict[str, list[_Sample]]:
-    """The samples from every origin, in the order of reception."""
+    """The samples from every topic and frame, in the order of reception."""
     try:
         from rosbags.rosbag2 import Reader
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise LogError(f"{path}: ROS bags need an extra: pip install 'torchfsid[ros]'") from error
-    # The three types are the same in every ROS 2: no definition in the bag, of whatever other type, has to be parsed.
+    # The three types are the same in every ROS 2, so no type definition in the bag has to be parsed.
     decode = get_typestore(Stores.LATEST).deserialize_cdr
     samples: dict[str, list[_Sample]] = {origin: [] for origin, _ in bag.origins}
     frames: set[str] = set()
@@ -96,7 +103,7 @@ def _read(path: Path, bag: BagConfig) -> dict[str, list[_Sample]]:
         raise
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror or one_line(error)}") from error
-    except Exception as error:  # of many kinds, whatever wrong bytes led the parsers to
+    except Exception as error:  # damaged bytes make the parsers raise many kinds
         raise LogError(f"{path}: not a valid ROS bag: {one_line(error)}") from error
     if missing := bag.frames.keys() - frames:
         there = reprlib.repr(sorted(frames))
@@ -107,7 +114,7 @@ def _read(path: Path, bag: BagConfig) -> dict[str, list[_Sample]]:
 
 
 def _wanted(path: Path, types: dict[str, set[str]], bag: BagConfig) -> set[str]:
-    """The topics to be read, all of them there and of the type that they must have."""
+    """The topics to read. Each must be in the bag and have an allowed type."""
     expected = dict.fromkeys(bag.topics, (ODOMETRY, POSE)) | ({TF_TOPIC: (TRANSFORMS,)} if bag.frames else {})
     for topic, allowed in expected.items():
         if topic not in types:
@@ -143,8 +150,10 @@ def _sample(where: str, header: Any, position: Any, velocity: tuple[float, ...] 
 
 
 def _rotated(quaternion: tuple[float, ...], vector: tuple[float, ...]) -> tuple[float, ...]:
-    """The vector, turned by the quaternion (w, x, y, z), whose norm need not be 1 exactly: v + w t + q x t with
-    t = 2 (q x v) / norm^2."""
+    """The vector v turned by the quaternion (w, q): v + w t + q x t, with t = 2 (q x v) / norm^2.
+
+    The norm of the quaternion may differ slightly from 1.
+    """
     w, *axis = quaternion
     twice = [2 / sum(q * q for q in quaternion) * c for c in _cross(axis, vector)]
     return tuple(v + w * t + c for v, t, c in zip(vector, twice, _cross(axis, twice), strict=True))
@@ -167,7 +176,7 @@ def _track(where: str, body: str, samples: Sequence[_Sample]) -> Track:
 
 
 def _clock(stamps: Int[np.ndarray, "samples"], rate: float) -> Int[np.ndarray, "times"]:
-    """From the first to the last of the stamps [ns], at a rate [Hz]."""
+    """Times [ns] at this rate [Hz], from the first to the last stamp."""
     times = 1 + float(stamps[-1] - stamps[0]) * 1e-9 * rate
     if not 2 <= times <= MAX_TIMES:
         raise ConfigError(f"bag.rate: {rate} Hz makes {times:.3g} times of the first body's, expected 2 to {MAX_TIMES}")

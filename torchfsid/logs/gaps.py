@@ -1,17 +1,17 @@
-r"""Bodies that are missing from a log for a while: where they can have been.
+r"""Bodies that are missing from a log for a while: bounds on where they were.
 
-A body that was seen at s and at s + h, h seconds later, and not in between, is somewhere. Assumption: during the gap no
-body is faster than v, the largest speed that the log shows of any. Then at s + l h, with 0 < l < 1,
+A body is seen at s and at s + h, h seconds later, and not in between. Assumption: during the gap the body is not faster
+than v, the largest speed of any body in the log. Then at s + l h, with 0 < l < 1,
 
     x = (1 - l) x(s) + l x(s + h)       error <= 2 l (1 - l) h v
     u = 0                               error <= v
 
-Proof: x - x_true = (1 - l) (x(s) - x_true) + l (x(s + h) - x_true), and x_true is at most l h v away from x(s) and
-(1 - l) h v from x(s + h).
+Proof: x - x_true = (1 - l) (x(s) - x_true) + l (x(s + h) - x_true), and x_true is at most l h v away from x(s) and (1 -
+l) h v from x(s + h).
 
-So a row of such a body is a row like the others, of wider bounds: it is left out where it is provably inactive, and
-counts as active in every direction where the body may be anywhere around the robot. Of the missing robot itself the
-sample says nothing. A body that has not come yet, or never comes back, is not there.
+A row of such a body is an ordinary row with wider bounds. It is left out where it is provably inactive. It counts as
+active in every direction where the body may be anywhere around the robot. The sample says nothing about the missing
+robot itself. Before its first and after its last sample a body is not there.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from torchfsid.logs.log import Log
 
 
 def bridged(log: Log) -> Log:
-    """The log in which bodies that are missing for a while are where they can be; others are as they were."""
+    """The log with gaps filled by interpolation, with the bounds above. Bodies without gaps are unchanged."""
     earlier = np.maximum.accumulate(np.where(log.seen, np.arange(len(log.t))[:, None], -1), axis=0)
     later = np.minimum.accumulate(np.where(log.seen, np.arange(len(log.t))[:, None], len(log.t))[::-1], axis=0)[::-1]
     gap = ~log.seen & (earlier >= 0) & (later < len(log.t))
@@ -52,7 +52,7 @@ def bridged(log: Log) -> Log:
 
 
 def _fastest(log: Log) -> float:
-    """The largest speed in the log, logged or needed to get from one row of a body to its next [m/s]."""
+    """The largest speed in the log [m/s], logged or needed to get from one sample of a body to its next."""
     speeds = [0.0] if log.u is None else [float(np.linalg.norm(log.u[log.velocity_known], axis=-1).max(initial=0.0))]
     for j in range(len(log.bodies)):
         rows = np.flatnonzero(log.seen[:, j])

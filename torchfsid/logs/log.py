@@ -1,15 +1,15 @@
-r"""Logs that someone recorded, as measurements.
+r"""Recorded logs, as measurements.
 
-In a table (CSV, Parquet) one row per body and time, the rows of one time together, times increasing, other columns
-ignored:
+A table (CSV, Parquet) has one table row per body and time. The table rows of one time stand together, and times
+increase. Other columns are ignored.
 
     t, robot, x, y[, z][, vx, vy[, vz]][, radius]          [s], a name, [m], [m/s], [m]
 
-(vx, vy) is the control computed at t from the positions at t. It is held until the next sample t_+ (zero-order hold):
-where it was not logged, it is (x(t_+) - x(t)) / (t_+ - t), exactly. A body without a row at t is not there at t; if it
-has rows before and after, see `gaps`.
+(vx, vy) is the control computed at t from the positions at t. It is held until the next sample t_+ (zero-order hold).
+If it was not logged, it is exactly (x(t_+) - x(t)) / (t_+ - t). A body without a table row at t is not there at t. If
+it has table rows before and after, see `gaps`.
 
-Nothing here imports torch before the measurements are asked for, so that a wrong log is refused at once.
+PyTorch is imported only when the measurements are asked for, so that a wrong log is refused at once.
 """
 
 from __future__ import annotations
@@ -37,20 +37,22 @@ stamps in nanoseconds of up to 100 kHz, or in microseconds of up to 100 Hz, are 
 
 @dataclass(frozen=True)
 class Log:
-    """T times of N bodies. Where something is unknown its entries are zeros, never NaN, and a mask says so.
+    """T times of N bodies. Unknown entries are zeros, never NaN, and a mask marks them.
 
     Attributes:
         source: the file.
-        bodies: their names, in the order in which they appear.
+        bodies: the names, in the order in which they appear.
         t: times [s], increasing.
         x: positions [m].
-        u: velocities [m/s]; None if the log has none.
+        u: velocities [m/s], or None if the log has none.
         seen: the body is there at t.
-        velocity_known: and so is its velocity.
-        radius: [m]; None if the log has none.
-        position_error, velocity_error: bounds on the errors of x [m] and u [m/s]; None: zero.
-        lost: the body is there at t, but nobody knows where; None: a body that is not seen is not there.
-        bridged: the body was not measured at t, it is where it can be (see `gaps`): itself, it says nothing.
+        velocity_known: the body is there at t and its velocity is known.
+        radius: radii [m], or None if the log has none.
+        position_error: bounds on the errors of x [m]. None means zero.
+        velocity_error: bounds on the errors of u [m/s]. None means zero.
+        lost: the body is there at t but its position is unknown. None means that a body that is not seen is not there.
+        bridged: the body was not measured at t, and its position is interpolated (see `gaps`). It is then not observed
+            itself.
     """
 
     source: str
@@ -68,16 +70,18 @@ class Log:
 
     @property
     def previous_known(self) -> Bool[np.ndarray, "times bodies"]:
-        """The body's velocity one sample earlier is known; so not at the first sample, nor at a body's first."""
+        """Is the body's velocity one sample earlier known? It is not at the log's first sample, nor at the body's
+        first.
+        """
         return _one_earlier(self.velocity_known)
 
     def differentiated(self) -> Log:
         """The log with velocities from differences of its positions (module docstring), without its last time.
 
-        The velocity of a body that is missing from the next sample is not known.
+        The velocity of a body that is missing from the next sample is unknown.
 
         Raises:
-            LogError: a difference quotient is not a finite number.
+            LogError: a difference quotient is not finite.
         """
         known = self.seen[:-1] & self.seen[1:]
         with np.errstate(over="ignore", invalid="ignore"):
@@ -92,11 +96,16 @@ class Log:
     ) -> Iterator[Measurement]:
         """One measurement per time, of the batch of these robots among all bodies.
 
-        A robot is `observed` where its velocity is known, the `required` bodies (the leader of a formation) are there,
-        and the `neighbour_velocities` that its barriers use are known: for `current` the velocity of every body that is
-        there, for `previous` that of every body that is there (the robot included) one sample earlier. A row with an
-        unknown right-hand side cannot just be left out: it may be the active one, and the set would lose the truth. For
-        the same reason no robot is observed while a body is `lost`. A body that is `bridged` serves others only.
+        A robot is `observed` where its velocity is known, the `required` bodies are there, and the
+        `neighbour_velocities` are known. A row with an unknown right-hand side cannot be left out: it may be the active
+        one, and the set would lose the truth. For the same reason no robot is observed while a body is `lost`. A
+        `bridged` body is not observed, but other robots avoid it.
+
+        Args:
+            robots: names of the robots of the batch.
+            neighbour_velocities: what the barriers use. `current` needs the velocity of every body that is there.
+                `previous` needs the same one sample earlier, the robot's own included.
+            required: bodies without which a measurement says nothing, such as the leader of a formation.
 
         Raises:
             LogError: the log has no velocities, or no body of that name.
@@ -116,7 +125,7 @@ class Log:
         if self.bridged is not None:
             observed &= ~self.bridged[:, index]
         neighbour_error = self.velocity_error
-        if neighbour_error is not None and "previous" in neighbour_velocities:  # one bound serves both moments
+        if neighbour_error is not None and "previous" in neighbour_velocities:  # one bound for both times
             neighbour_error = np.maximum(neighbour_error, _one_earlier(neighbour_error))
         return self._measurements(self.u, index, observed, neighbour_error)
 
@@ -151,7 +160,7 @@ class Log:
 
 
 def _one_earlier(values: np.ndarray) -> np.ndarray:
-    """The values of the sample before; zeros before the first."""
+    """The values one sample earlier. They are zero at the first sample."""
     return np.concatenate([np.zeros_like(values[:1]), values[:-1]])
 
 
@@ -159,16 +168,16 @@ def read_csv(path: str | Path) -> Log:
     """The log in a CSV file (UTF-8, one header line).
 
     Raises:
-        LogError: the file cannot be read, or is not such a log; the message names the line, and the column.
+        LogError: the file cannot be read, or is not such a log. The message names the line and the column.
     """
     return _log_in(CsvTable(str(path)))
 
 
 def read_parquet(path: str | Path) -> Log:
-    """The log in a Parquet file, of the same columns. Needs the extra `parquet`.
+    """The log in a Parquet file with the same columns. Needs the extra `parquet`.
 
     Raises:
-        LogError: the file cannot be read, or is not such a log; the message names the row, and the column.
+        LogError: the file cannot be read, or is not such a log. The message names the table row and the column.
     """
     return _log_in(ParquetTable(str(path)))
 

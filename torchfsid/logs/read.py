@@ -11,11 +11,15 @@ from torchfsid.logs.log import Log, read_csv, read_parquet
 
 
 def read_log(path: str | Path, bag: BagConfig | None = None) -> Log:
-    """The log at `path`: a rosbag2 folder, .mcap, .db3, .parquet, and whatever is called otherwise as CSV.
+    """The log at `path`: a rosbag2 folder, .mcap, .db3 or .parquet. Any other suffix is read as CSV.
+
+    Args:
+        path: the file or folder.
+        bag: where the bodies are in a ROS bag. Other logs ignore it.
 
     Raises:
-        LogError: it cannot be read, or is not what its name says.
-        ConfigError: it is a ROS bag, and `bag` does not say where the bodies are in it, or wrongly.
+        LogError: it cannot be read, or is not what its suffix says.
+        ConfigError: it is a ROS bag, and `bag` is missing or does not fit it.
     """
     path = Path(path)
     suffix = path.suffix.lower()

@@ -1,21 +1,21 @@
-r"""Bodies that were measured at different times, on one clock, with bounds on what that does.
+r"""Bodies that were measured at different times, brought onto one clock with bounds on the errors.
 
 Between two consecutive samples of a body, h seconds apart, at s_k + l h with 0 <= l <= 1,
 
     x = (1 - l) x_k + l x_{k+1}       error <= l (1 - l) h V
     u = (1 - l) u_k + l u_{k+1}       error <= 2 l (1 - l) V
 
-Assumption: between two samples the velocity changes by no more than V, the largest change of velocity that the samples
-around show: from one sample to the next in this interval and the two beside it, and from them to the mean velocity
-(x_{k+1} - x_k) / h. For u also: no faster than V / h, i.e. (vx, vy) at t is, as in every log, the command for the
-positions at t, which move on continuously even where a command is held. Both errors vanish at samples.
+Assumption: between two samples the velocity changes by no more than V. V is the largest change of velocity in this
+interval and the two beside it: from one sample to the next, and from a sample to the mean velocity (x_{k+1} - x_k) / h.
+The bound on u also assumes that u changes no faster than V / h. As in every log, (vx, vy) at t is the command for the
+positions at t, and these change continuously even where a command is held. Both errors are zero at samples.
 
 Proof: with m, m' the mean velocities before and after, x(t) = x_k + l h m and x_{k+1} - x_k = h (l m + (1 - l) m'), so
 the error of x is l (1 - l) h (m - m'), and |m - m'| <= V. And |u(t) - u_k| <= l V, |u(t) - u_{k+1}| <= (1 - l) V.
 
-A body without logged velocities has only those means: its V is the sum of the mean's changes to the interval before and
-to the one after, where it has both. Taken as velocities (`differentiated`), the means have an error of at most V, also
-at the samples.
+A body without logged velocities has mean velocities only. Its V is the sum of the changes of the mean velocity to the
+interval before and to the interval after, where these exist. If the means are taken as velocities (`differentiated`),
+their error is at most V, also at the samples.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ MIN_RUN = 3
 
 @dataclass(frozen=True)
 class Track:
-    """One body's own samples.
+    """The samples of one body.
 
     Attributes:
-        body: its name.
-        stamps: increasing [ns].
+        body: the name.
+        stamps: times [ns], increasing.
         x: positions [m].
-        u: velocities [m/s]; None if not measured.
+        u: velocities [m/s], or None if not measured.
     """
 
     body: str
@@ -56,7 +56,12 @@ class Track:
 
 @dataclass(frozen=True)
 class ResampledLog(Log):
-    """A log whose bodies were measured at other times than its own. A body that is not seen is lost, not gone."""
+    """A log whose bodies were measured at other times than its own. A body that is not seen is `lost`.
+
+    Attributes:
+        tracks: the bodies' own samples.
+        clock: the times of the log [ns].
+    """
 
     tracks: tuple[Track, ...] = ()
     clock: Int[np.ndarray, "times"] | None = None
@@ -74,11 +79,18 @@ def log_of_tracks(
     clock: Int[np.ndarray, "times"] | None,
     radius: Float[np.ndarray, "bodies"] | None,
 ) -> Log:
-    """The tracks as a log, as they are where all have the same stamps, otherwise on `clock` [ns] (default: the stamps
-    of the first).
+    """The tracks as one log.
+
+    If all bodies have the same stamps, these are the times. Otherwise the bodies are resampled.
+
+    Args:
+        source: the file, for messages.
+        tracks: one per body.
+        clock: times onto which the bodies are resampled [ns]. Default: the stamps of the first body.
+        radius: radii of the bodies [m], or None.
 
     Raises:
-        LogError: at no time of the clock is every body known.
+        LogError: at no time of the clock are all bodies known.
     """
     first = tracks[0]
     if not all(np.array_equal(track.stamps, first.stamps) for track in tracks):
@@ -99,12 +111,12 @@ def log_of_tracks(
 
 
 def seconds(stamps: Int[np.ndarray, "times"]) -> Float[np.ndarray, "times"]:
-    """[ns] to [s], rounded once: the stamp of a time that was written as a decimal gives back that time."""
+    """[ns] to [s], rounded once. A time that was written as a decimal gives back the same decimal."""
     return np.array([stamp / 1_000_000_000 for stamp in stamps.tolist()])
 
 
 class _Samples(NamedTuple):
-    """One body on the clock; zeros where not seen, or its velocity not known."""
+    """One body on the clock. Entries are zero where the body is not seen or its velocity is unknown."""
 
     x: Float[np.ndarray, "times 2"]
     u: Float[np.ndarray, "times 2"]
@@ -187,7 +199,7 @@ def _mean_velocities(track: Track) -> Float[np.ndarray, "intervals 2"]:
 
 
 def _change_of_velocity(track: Track) -> Float[np.ndarray, "intervals"]:
-    """V of each interval between samples [m/s]; NaN in gaps, and where too few samples follow each other."""
+    """V of each interval between samples [m/s]. It is NaN in gaps, and where there are too few consecutive samples."""
     periods, means = np.diff(track.stamps), _mean_velocities(track)
     change = np.full(len(periods), np.nan)
     joined = np.flatnonzero(periods <= MAX_GAP * np.median(periods))

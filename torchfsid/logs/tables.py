@@ -1,4 +1,4 @@
-"""Tables of a log: rows of named columns, from CSV or Parquet, whose every mistake is named by row and column."""
+"""Tables of a log: named columns from CSV or Parquet. An error message names the table row and the column."""
 
 from __future__ import annotations
 
@@ -21,35 +21,52 @@ A_NUMBER = f"a finite number of at most {LARGEST:g}"
 
 @runtime_checkable
 class Table(Protocol):
-    """Rows of named columns."""
+    """A table of named columns.
+
+    Attributes:
+        source: the file.
+        header: the names of the columns.
+    """
 
     source: str
     header: list[str]
 
     def error(self, row: int, message: str) -> LogError:
-        """A mistake in the row of this index."""
+        """The error for a mistake in the table row of this index, counted from 0."""
         ...
 
     def header_error(self, message: str) -> LogError:
-        """A mistake in the names of the columns."""
+        """The error for a mistake in the names of the columns."""
         ...
 
     def names(self, column: str) -> list[str]:
-        """The column as names, none of them empty."""
+        """The column as names, none of them empty.
+
+        Raises:
+            LogError: an entry is not a name.
+        """
         ...
 
     def numbers(self, column: str) -> Float[np.ndarray, "rows"]:
-        """The column as numbers, none larger than `LARGEST`."""
+        """The column as numbers, none larger than `LARGEST`.
+
+        Raises:
+            LogError: an entry is not such a number.
+        """
         ...
 
 
 def is_measurable(values: Any) -> Any:
-    """Is it a number that can have been measured? Squares of such numbers, and their squares, are finite."""
+    """Can this number have been measured? Its square and the square of that must be finite."""
     return np.abs(values) <= LARGEST
 
 
 def require_column(table: Table, name: str) -> None:
-    """Raises `LogError` if the table has not exactly one column of that name."""
+    """Check that the table has exactly one column of that name.
+
+    Raises:
+        LogError: it has none, or several.
+    """
     count = table.header.count(name)
     if count != 1:
         problem = f"{count} columns are called" if count else "no column"
@@ -57,7 +74,11 @@ def require_column(table: Table, name: str) -> None:
 
 
 def checked_names(table: Table, column: str, names: list[str]) -> list[str]:
-    """Raises `LogError` for a name that is empty or holds a NUL, which no terminal and no file name can show."""
+    """The names, if each can be shown in a terminal and used as a file name.
+
+    Raises:
+        LogError: a name is empty or holds a NUL.
+    """
     for name in dict.fromkeys(names):
         if not name:
             raise table.error(names.index(name), f"column {column!r} is empty")
@@ -67,7 +88,7 @@ def checked_names(table: Table, column: str, names: list[str]) -> list[str]:
 
 
 class CsvTable:
-    """The cells of a CSV file, as text, with the line of the file that each row stands on."""
+    """A CSV file: its cells as text, and the line of the file on which each stands."""
 
     def __init__(self, source: str):
         self.source = source
@@ -121,7 +142,7 @@ class CsvTable:
 
 
 def _is_plain(text: str) -> bool:
-    """Python reads 1_0 as ten, and digits of any script: no program that writes logs means that."""
+    """Is the text free of notation that only Python reads as a number, such as 1_0 or digits of other scripts?"""
     return text.isascii() and "_" not in text
 
 
@@ -133,7 +154,7 @@ def _is_number(cell: str) -> bool:
 
 
 class ParquetTable:
-    """The columns of a Parquet file, read when they are asked for; rows are counted from 1."""
+    """A Parquet file. Its columns are read when they are asked for. Messages count table rows from 1."""
 
     def __init__(self, source: str):
         try:
@@ -149,7 +170,7 @@ class ParquetTable:
         try:
             self.file = ParquetFile(BufferReader(content))
             self.header: list[str] = self.file.schema_arrow.names
-        except Exception as error:  # of many kinds, whatever wrong bytes led the parser to
+        except Exception as error:  # damaged bytes make the parser raise many kinds
             raise LogError(f"{source}: not valid Parquet: {one_line(error)}") from error
         if self.file.metadata.num_rows == 0:
             raise self.header_error("no rows")
@@ -182,14 +203,14 @@ class ParquetTable:
         return values
 
     def _column(self, column: str) -> Any:
-        """One Arrow array; of a column of categories, their values."""
+        """The column as one Arrow array. A column of categories is replaced by its values."""
         from pyarrow import types
 
         try:
             cells = self.file.read(columns=[column]).column(column).combine_chunks()
             cells.validate(full=True)
             cells = cells.dictionary_decode() if types.is_dictionary(cells.type) else cells
-        except Exception as error:  # of many kinds, as above: the pages are parsed only now
+        except Exception as error:  # as above: the pages are parsed only now
             raise LogError(f"{self.source}: not valid Parquet: {one_line(error)}") from error
         if len(cells) != self.file.metadata.num_rows:
             raise LogError(
