@@ -1,8 +1,8 @@
-"""Does a log fit its declared model? Asked of the log alone, without any truth, for `torchfsid check`.
+"""`torchfsid check`: does a log fit its declared model? Answered from the log alone, without the true parameter.
 
-Per robot: the smallest velocity bound that explains its motion, the residuals of its samples (`consistency`), and which
-rows of the model stand behind the samples that contradict it at the declared bound. For the whole log: whether another
-alignment of velocities with positions would fit better, since a shift of one sample breaks the KKT conditions.
+For each robot: the smallest velocity bound that explains its motion, the residuals of its samples (`consistency`), and
+the rows of the model that contradict samples at the declared bound. For the whole log: whether another alignment of
+velocities with positions fits better, because a shift of one sample breaks the KKT conditions.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ BETTER = 0.8
 
 @dataclass(frozen=True)
 class Fault:
-    """Samples of a robot at odds with the declared bounds because of one row of the model.
+    """Samples of a robot that contradict the declared bounds because of one row of the model.
 
     Attributes:
-        row: its label.
-        soft: the controller may violate it.
-        samples: how many there are.
-        first: the time of the first [s].
-        worst: the most by which a bound is exceeded [m/s].
+        row: label of the row.
+        soft: the controller may violate the row.
+        samples: number of such samples.
+        first: time of the first [s].
+        worst: largest amount by which a bound is exceeded [m/s].
     """
 
     row: str
@@ -45,20 +45,24 @@ class Fault:
     worst: float
 
     def to_json(self) -> dict:
+        """The entry of `check.json`."""
         return {**vars(self), "worst": _finite(self.worst)}
 
 
 @dataclass(frozen=True)
 class RobotCheck:
-    """What its own motion says about a robot. Bounds and residuals in m/s; infinite: above the largest speed.
+    """What a robot's motion says about the declared model. A bound or residual is infinite above the largest speed.
 
     Attributes:
-        smallest_bound: the smallest velocity bound that explains the motion.
-        median, p95, worst: quantiles of the residuals of its samples.
-        worst_time: when the worst was [s].
-        samples: how many say something about theta.
+        robot: name of the robot.
+        smallest_bound: the smallest velocity bound that explains the motion [m/s].
+        median: median of the residuals of the samples [m/s].
+        p95: 95th percentile of the residuals [m/s].
+        worst: largest residual [m/s].
+        worst_time: time of the largest residual [s].
+        samples: number of samples that say something about theta.
         contradictions: samples that the best Theta cannot explain with the declared bound.
-        violations: rows violated beyond their bound.
+        violations: samples at which a row is violated by more than its bound.
     """
 
     robot: str
@@ -74,13 +78,15 @@ class RobotCheck:
 
 @dataclass(frozen=True)
 class Check:
-    """A log against its declared model.
+    """The result of checking a log against its declared model.
 
     Attributes:
-        declared: the velocity bound of the configuration [m/s], or what `auto` would take.
+        robots: one entry per robot.
+        declared: the velocity bound of the configuration, or the one that `auto` takes [m/s].
         is_auto: the configuration says `auto`.
         fastest: the largest speed in the log [m/s].
-        shifts: `smallest_bound` if velocities are taken so many samples later; infinite: not below that of no shift.
+        shifts: number of samples by which velocities are taken later, to the `smallest_bound` then [m/s]. It is
+            infinite if it is not below that without a shift.
     """
 
     robots: tuple[RobotCheck, ...]
@@ -96,12 +102,12 @@ class Check:
 
     @property
     def best_shift(self) -> int:
-        """How many samples later the velocities fit clearly better; 0: aligned as they are."""
+        """The number of samples by which later velocities fit clearly better. 0: no shift does."""
         best = min(self.shifts, key=lambda shift: self.shifts[shift])
         return best if self.shifts[best] < BETTER * self.smallest_bound else 0
 
     def conclusions(self) -> list[str]:
-        """In plain words."""
+        """The conclusions as sentences, with remedies."""
         lines = [self._fit()]
         if self.best_shift:
             later = "later" if self.best_shift > 0 else "earlier"
@@ -146,7 +152,7 @@ class Check:
         return line
 
     def to_json(self) -> dict:
-        """As `check.json` holds it: what is infinite is null."""
+        """The content of `check.json`. Infinite values are null."""
         return {
             "smallest_bound": _finite(self.smallest_bound),
             "declared": self.declared,
@@ -214,7 +220,7 @@ def check(declared: DeclaredLog) -> Check:
 
 
 class _Faults:
-    """All samples at the declared bound: the row that each is at odds with, and by how much."""
+    """For all samples, at the declared bound: the row that a sample contradicts, and by how much."""
 
     def __init__(
         self, labels: Sequence[str], consistency: Consistency, theta: FeasibleSet, velocity: float, residuals: Tensor
@@ -270,7 +276,7 @@ def _count(faults: Sequence[Fault], row: str | None = None) -> int:
 
 
 def _quantile(values: Tensor, q: float) -> float:
-    """The smallest value that at least the fraction q does not exceed; NaN of nothing."""
+    """The smallest value that is not exceeded by at least the fraction q of the values. NaN if there are none."""
     if len(values) == 0:
         return math.nan
     return float(values.sort().values[max(0, math.ceil(q * len(values)) - 1)])

@@ -1,11 +1,11 @@
-"""What every command line of the project shares: arguments, one line for whatever goes wrong, exit codes, signals.
+"""The common scaffold of the command lines: arguments, exit codes, one line per error, signals.
 
     0             done
     2             a mistake of the caller: nothing was written
-    1             it failed later, as on a full disk: what was written before is whole
+    1             it failed later, for example on a full disk: files written before are whole
     128 + number  ended by a signal: Ctrl-C (130), SIGTERM (143), SIGHUP (129)
 
-Nothing here is slow to import, so that a command that imports the rest inside `execute` answers Ctrl-C at once.
+This module imports nothing slow. A command that imports the rest inside `execute` answers Ctrl-C at once.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ DONE, FAILURE, USAGE_ERROR = 0, 1, 2
 
 
 class Parser(argparse.ArgumentParser):
-    """Mistakes are answered by one line."""
+    """A parser that reports a mistake in one line."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(USAGE_ERROR, f"{self.prog}: {message}\n")
 
 
 def add_overrides(command: argparse.ArgumentParser) -> None:
-    """The option `--set a.b=value`, whose values `apply_overrides` takes."""
+    """Add the option `--set a.b=value`, whose values go to `apply_overrides`."""
     command.add_argument(
         "--set", action="append", default=[], metavar="A.B=VALUE", help="override a key of the configuration"
     )
@@ -45,20 +45,20 @@ def execute(
     folder: ResultsFolder | None = None,
     left: str = "what is done so far is in {folder}",
 ) -> int:
-    """Run a command and return its exit code; whatever goes wrong is one line on stderr.
+    """Run a command and return its exit code. An error is one line on stderr.
 
     Args:
-        program: the name in front of that line.
+        program: the name at the start of that line.
         action: the command. It imports what it needs itself (`interruption.importing`), slow modules last.
-        folder: where it writes; given back at the end.
-        left: what to say of an interrupted command that had begun to write.
+        folder: the results folder. It is released at the end.
+        left: what to say if the command is interrupted after it began to write.
     """
 
     def has_begun() -> bool:
         return folder is not None and folder.claimed
 
     code, message = DONE, ""
-    # The message is printed below the `except` clauses, when the frames of the exception are gone and with them a
+    # The message is printed below the `except` clauses. By then the frames of the exception are gone, and with them a
     # progress line.
     try:
         with interruptible(program):
@@ -86,7 +86,7 @@ def execute(
 
 
 def use_one_thread() -> None:
-    """Tensors here are small: more threads would only wait for each other."""
+    """Let torch use one thread. The tensors here are small, and more threads would only wait for each other."""
     import torch
 
     torch.set_num_threads(1)
@@ -100,7 +100,7 @@ def _flush() -> None:
 
 
 def silence(descriptor: int) -> None:
-    """What is still to be written to a closed pipe goes nowhere, instead of failing again at exit."""
+    """Redirect a closed pipe to nowhere, so that what is still to be written does not fail again at exit."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, descriptor)
     os.close(nowhere)

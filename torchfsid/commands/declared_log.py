@@ -1,4 +1,4 @@
-"""A log and the declared model, checked against each other: what every command needs before it can begin."""
+"""A log together with its declared model, checked against each other before a command begins."""
 
 from __future__ import annotations
 
@@ -27,11 +27,15 @@ class DeclaredLog:
     """A log and the model that its configuration declares.
 
     Attributes:
-        log: with differences of its positions for velocities, if the configuration says so, and without gaps (`gaps`).
-        robots: the bodies to infer. task, barriers: the model. prior: the robots' prior sets.
+        config: the configuration.
+        log: the log, with gaps filled (`gaps`), and with velocities from differences of positions if `config` says so.
+        robots: the bodies to infer.
+        task: the task of the model.
+        barriers: the barriers of the model.
+        prior: the prior sets of the robots.
 
     Raises:
-        ConfigError: the model needs what the log does not have (a body, velocities, radii, planar positions).
+        ConfigError: the model needs something that the log does not have (a body, velocities, radii, planar positions).
     """
 
     config: ObserveConfig
@@ -61,15 +65,15 @@ class DeclaredLog:
 
     @property
     def row_labels(self) -> list[str]:
-        """A name for each row of the model."""
+        """A label for each row of the model."""
         return [label for barrier in self.barriers for label in barrier.labels(self.log.bodies)]
 
     def measurements(self) -> Iterator[Measurement]:
-        """The samples of the robots."""
+        """The samples of the robots, in the order of time."""
         return self.log.measurements(self.robots, self.config.neighbour_velocities, self.config.required)
 
     def consistency(self) -> Consistency:
-        """What the log says about the errors, under the model and all declared bounds but that on the velocity."""
+        """What the log says about the velocity bound, under the model and all other declared bounds."""
         noise = self.config.noise
         return Consistency(
             list(self.measurements()),
@@ -82,7 +86,7 @@ class DeclaredLog:
         )
 
     def shifted(self, samples: int) -> DeclaredLog:
-        """The same in which the velocities of a sample are those logged so many samples later."""
+        """The same log with velocities taken this number of samples later."""
         log, times = self.log, len(self.log.t)
         kept = slice(max(0, -samples), times - max(0, samples))
         moved = slice(max(0, samples), times + min(0, samples))
@@ -101,23 +105,28 @@ class DeclaredLog:
         return replace(self, config=self.config.model_copy(update={"velocity": "logged"}), log=shifted)
 
     def with_velocity_bound(self, bound: float) -> DeclaredLog:
-        """The same with another `noise.velocity` [m/s]."""
+        """The same log and model with `noise.velocity` = `bound` [m/s]."""
         other = copy(self)
         other.config = self.config.with_velocity_bound(bound)
         return other
 
     def smallest_bounds(self) -> dict[str, float]:
-        """For each robot the smallest velocity bound with which the model explains its motion [m/s]; infinite if none
-        up to the largest speed in the log does."""
+        """For each robot, the smallest velocity bound with which the model explains its motion [m/s].
+
+        It is infinite if no bound up to the largest speed in the log does.
+        """
         consistency = self.consistency()
         return dict(zip(self.robots, consistency.smallest_bounds(consistency.fastest).tolist(), strict=True))
 
 
 def automatic_bound(smallest: Mapping[str, float]) -> float:
-    """What `noise.velocity: auto` takes, given the robots' smallest bounds [m/s].
+    """The bound that `noise.velocity: auto` takes [m/s].
+
+    Args:
+        smallest: each robot's smallest bound [m/s], as `DeclaredLog.smallest_bounds` returns it.
 
     Raises:
-        ConfigError: one of them is infinite.
+        ConfigError: one of them is infinite: the model is wrong. `torchfsid check` says where.
     """
     unexplained = [robot for robot, bound in smallest.items() if bound == math.inf]
     if unexplained:

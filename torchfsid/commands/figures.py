@@ -1,4 +1,6 @@
-"""The figure of an observed log, from its saved results: the final regions over the trajectories, and how they came."""
+"""The figure of an observed log, from its saved results: final regions over the trajectories, sizes and cases over
+time.
+"""
 
 from __future__ import annotations
 
@@ -64,11 +66,13 @@ WIDE_FONTS = (
 
 
 def draw_observation(out: Path, x: np.ndarray, seen: np.ndarray, bodies: Sequence[str]) -> list[Path]:
-    """Draw regions.png and regions.pdf into the results folder `out`, from its files and the log's positions.
+    """Draw regions.png and regions.pdf from the files of the results folder and the positions of the log.
 
     Args:
+        out: the results folder.
         x: (T, N, 2) positions of the bodies [m].
         seen: (T, N) where they were measured.
+        bodies: names of the bodies.
 
     Raises:
         FigureError: a file is missing or damaged, or matplotlib fails.
@@ -78,7 +82,7 @@ def draw_observation(out: Path, x: np.ndarray, seen: np.ndarray, bodies: Sequenc
     paths = [out / "regions.png", out / "regions.pdf"]
     try:
         with mpl.rc_context({**STYLE, "font.family": _fonts()}), warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="Glyph .* missing from")  # no font has it: a box is drawn
+            warnings.filterwarnings("ignore", message="Glyph .* missing from")  # if no font has a glyph, a box is drawn
             figure = Figure(figsize=(10.5, 5.2), layout="constrained")
             grid = figure.add_gridspec(2, 2, width_ratios=(1.25, 1), height_ratios=(2.2, 1))
             _draw_map(figure.add_subplot(grid[:, 0]), final, x, seen, bodies)
@@ -89,9 +93,9 @@ def draw_observation(out: Path, x: np.ndarray, seen: np.ndarray, bodies: Sequenc
             for path in paths:
                 content = io.BytesIO()
                 figure.savefig(content, format=path.suffix[1:])
-                figure.set_layout_engine("none")  # once is enough: the layout is the slowest part of drawing
+                figure.set_layout_engine("none")  # computed once: the layout is the slowest part of drawing
                 drawn.append(content.getvalue())
-    except Exception as error:  # of many kinds, whatever names and numbers led matplotlib to
+    except Exception as error:  # unusual names and numbers make matplotlib raise many kinds
         raise FigureError(f"{paths[0]}: not drawn: {one_line(error)}") from error
     for path, content in zip(paths, drawn, strict=True):
         write_whole(path, content)
@@ -109,7 +113,7 @@ def _regions(path: Path) -> dict[str, Any]:
 
 
 def _history(path: Path) -> dict[str, dict[str, np.ndarray]]:
-    """Of each robot: times [s], diameters (NaN of an empty set), numbers of cases (NaN where not measured)."""
+    """For each robot: times [s], diameters (NaN if the set is empty) and indices of cases (NaN if not measured)."""
     columns: dict[str, tuple[list[float], list[float], list[float]]] = defaultdict(lambda: ([], [], []))
     number = {"": math.nan, **{case: float(i) for i, case in enumerate(CASES)}}
     try:
@@ -139,13 +143,13 @@ def _fonts() -> list[str]:
 
 
 def _thinned(values: np.ndarray) -> np.ndarray:
-    """At most `MOST_POINTS` of them, evenly, the last one among them."""
+    """At most `MOST_POINTS` of the values, evenly spaced, the last one included."""
     step = -(-len(values) // MOST_POINTS)
     return values if step <= 1 else values[(len(values) - 1) % step :: step]
 
 
 def _plain(name: str) -> str:
-    """A name as matplotlib shall write it: a dollar begins no formula, an underscore hides no line of a legend."""
+    """The name for matplotlib: a dollar starts no formula, and a leading underscore does not hide it from a legend."""
     name = name if len(name) <= 24 else f"{name[:23]}…"
     return (" " if name.startswith("_") else "") + name.replace("$", r"\$")
 
@@ -154,7 +158,7 @@ def _draw_map(axes: Axes, final: dict, x: np.ndarray, seen: np.ndarray, bodies: 
     for body in bodies:
         k = bodies.index(body)
         path = _thinned(x[seen[:, k], k])
-        if len(path) == 0:  # its only sample was the last one, which has no difference to a next one
+        if len(path) == 0:  # its only sample was the last one, where velocities from differences do not exist
             continue
         if body not in final:
             axes.plot(*path.T, color="0.75", lw=1)
@@ -186,7 +190,7 @@ def _draw_map(axes: Axes, final: dict, x: np.ndarray, seen: np.ndarray, bodies: 
 def _draw_sizes(axes: Axes, history: dict[str, dict[str, np.ndarray]]) -> None:
     for i, (robot, of) in enumerate(history.items()):
         axes.plot(_thinned(of["t"]), _thinned(of["diameter"]), color=_colour(i), lw=1.5, label=_plain(robot))
-    if any((of["diameter"] > 0).any() for of in history.values()):  # not so if all sets are points
+    if any((of["diameter"] > 0).any() for of in history.values()):  # false if all sets are points
         axes.set_yscale("log")
     axes.set(ylabel="diameter [m]", title="Size of the region")
     axes.grid(color="0.93", lw=0.6)

@@ -1,7 +1,7 @@
-"""Which task is it? Several hypotheses about the robots' task, each with a set of its own for every robot.
+"""Which task do the robots have? Each hypothesis has a set of its own for every robot.
 
-A hypothesis whose set becomes empty explains nothing any more: it is refuted for that robot, from that time on, by the
-rows that contradict each other. What is left may be true: a log can only ever tell which one is by refuting the others.
+A hypothesis is refuted for a robot when its set becomes empty. The rows that contradict each other are the evidence. A
+hypothesis that is left may be true or not: a log can only refute.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ class HypothesisVerdict:
     """What a log says about one hypothesis for one robot.
 
     Attributes:
-        status: `ok`, `alarm` or `inconsistent`; the last: refuted.
-        refuted_at: when its set became empty [s]; None: it did not.
-        evidence: the times [s] and rows that contradict each other then; the time of the prior is None.
-        volume: of its set at the end.
+        status: `ok`, `alarm` or `inconsistent`, see `Status`. `inconsistent` means refuted.
+        refuted_at: when its set became empty [s], or None.
+        evidence: times [s] and labels of the rows that contradict each other then. The time of the prior is None.
+        volume: volume of its set at the end.
     """
 
     status: str
@@ -35,6 +35,7 @@ class HypothesisVerdict:
     volume: float
 
     def to_json(self) -> dict:
+        """The entry of `hypotheses.json`."""
         evidence = [{"time": time, "row": row} for time, row in self.evidence]
         return {**vars(self), "evidence": evidence}
 
@@ -42,11 +43,11 @@ class HypothesisVerdict:
 class Hypotheses:
     """A log and several models by name, ready to run.
 
-    `velocity: auto` takes, for all of them alike, twice the smallest bound with which some hypothesis explains each
-    robot, so that no hypothesis is saved by a bound of its own.
+    With `velocity: auto` all hypotheses have the same bound, so that none survives by a larger bound of its own. It is
+    twice the smallest bound with which every robot is explained by some hypothesis.
 
     Raises:
-        ConfigError: no bound up to the largest speed lets any hypothesis explain some robot.
+        ConfigError: some robot is explained by no hypothesis, with any bound up to the largest speed.
     """
 
     def __init__(self, models: Mapping[str, DeclaredLog]):
@@ -63,7 +64,7 @@ class Hypotheses:
 
     @property
     def samples(self) -> int:
-        """How many samples all hypotheses read together."""
+        """The number of samples that all hypotheses read together."""
         return sum(observation.samples for observation in self.observations.values())
 
     @property
@@ -72,7 +73,7 @@ class Hypotheses:
         return next(iter(self.observations.values())).velocity_bound
 
     def write_verdicts(self, out: Path) -> None:
-        """hypotheses.json: what became of each hypothesis for each robot."""
+        """Write hypotheses.json: the verdict on each hypothesis for each robot."""
         verdicts = {
             robot: {name: verdict.to_json() for name, verdict in of_robot.items()}
             for robot, of_robot in self.verdicts().items()
@@ -80,7 +81,7 @@ class Hypotheses:
         write_json(out / "hypotheses.json", verdicts)
 
     def verdicts(self) -> dict[str, dict[str, HypothesisVerdict]]:
-        """For each robot, what became of each hypothesis. (The leader of a formation keeps no offset to itself.)"""
+        """For each robot, the verdict on each hypothesis. The leader of a formation has none on that formation."""
         verdicts: dict[str, dict[str, HypothesisVerdict]] = {}
         for name, observation in self.observations.items():
             labels, volumes = observation.declared.row_labels, observation.sets.feasible_set.volume().tolist()

@@ -1,7 +1,7 @@
-"""Signals that ask a command to end: Ctrl-C, SIGTERM from a scheduler, SIGHUP from a terminal that closes.
+"""Signals that end a command: Ctrl-C, SIGTERM from a scheduler, SIGHUP from a terminal that closes.
 
-The first one raises `Interrupted` where the command is, or as soon as what must not be left half done is done. Later
-ones are ignored, so that nobody who asks twice gets less.
+The first signal raises `Interrupted` at once, or at the end of a block that must not be left half done
+(`uninterrupted`). Later signals are ignored, so that a second one does not break off the cleaning up.
 """
 
 from __future__ import annotations
@@ -29,7 +29,9 @@ class Interrupted(KeyboardInterrupt):
 
 
 class _Now:
-    """What a signal does now, and which one waits. Signals come to the process: so this is of the process too."""
+    """How a signal is answered now, and which signal waits. Signals come to the process, so this is state of the
+    process.
+    """
 
     does: Literal["raise", "wait", "exit"] = "raise"
     waiting: int | None = None
@@ -37,7 +39,9 @@ class _Now:
 
 @contextlib.contextmanager
 def interruptible(program: str) -> Iterator[None]:
-    """Signals raise `Interrupted` in here. Those that the process was started to ignore (`nohup`) stay ignored."""
+    """In this block signals raise `Interrupted`. Signals that the process ignored from the start (`nohup`) stay
+    ignored.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -65,7 +69,7 @@ def interruptible(program: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def uninterrupted() -> Iterator[None]:
-    """A signal raises `Interrupted` only after this."""
+    """In this block signals wait. `Interrupted` is raised at its end."""
     before, _Now.does = _Now.does, "wait"
     try:
         yield
@@ -77,8 +81,10 @@ def uninterrupted() -> Iterator[None]:
 
 @contextlib.contextmanager
 def importing() -> Iterator[None]:
-    """A signal ends the process on the spot. Nothing is begun yet, and some modules crash where an exception meets them
-    while they are imported."""
+    """In this block a signal ends the process on the spot.
+
+    Nothing has begun yet, and some modules crash if an exception is raised while they are imported.
+    """
     before, _Now.does = _Now.does, "exit"
     try:
         yield

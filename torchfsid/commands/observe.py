@@ -1,4 +1,4 @@
-"""The observation of a log: from its measurements and a declared model to a results folder and a line per robot."""
+"""The observation of a log: from its measurements and a declared model to a results folder and a verdict per robot."""
 
 from __future__ import annotations
 
@@ -25,13 +25,20 @@ Track = Callable[[Iterable[Measurement]], Iterable[Measurement]]
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a log says about one robot. Of an empty set, sizes and centres are NaN as `FeasibleSet` has them.
+    """What a log says about one robot. Sizes and centres of an empty set are NaN, as in `FeasibleSet`.
 
     Attributes:
-        cases: how many samples of each case were used.
-        skipped: how many samples were not.
-        no_information_since: when the set last shrank [s]; None: never.
-        resets: when the robot changed its mind [s].
+        robot: name of the robot.
+        cases: number of samples used, by case.
+        skipped: number of samples not used.
+        volume: volume of the set [units of theta, to the power p].
+        diameter: diameter of the set.
+        centroid: centroid of the set.
+        centre: Chebyshev centre of the set.
+        radius: Chebyshev radius of the set.
+        no_information_since: when the set last shrank [s]. None: it never did.
+        resets: times at which the set started again from the prior [s].
+        status: `ok`, `alarm` or `inconsistent`, see `Status`.
     """
 
     robot: str
@@ -52,12 +59,13 @@ class Observation:
     """A log and the declared model, ready to run.
 
     Attributes:
-        declared: the two; with the velocity bound that was found, if the configuration said `auto`.
-        observer: the sets alone, or with the filter, if the configuration wants one.
-        smallest_bounds: for each robot the smallest velocity bound that explains its motion [m/s], if it said `auto`.
+        declared: the log and the model. With `velocity: auto`, with the bound that was determined.
+        sets: the observer of the sets.
+        observer: `sets` alone, or combined with the filter if the configuration has one.
+        smallest_bounds: with `velocity: auto`, each robot's smallest velocity bound that explains its motion [m/s].
 
     Raises:
-        ConfigError: see `automatic_bound`.
+        ConfigError: no bound explains some robot, see `automatic_bound`.
     """
 
     declared: DeclaredLog
@@ -80,7 +88,7 @@ class Observation:
 
     @property
     def log(self) -> Log:
-        """As it is observed: see `DeclaredLog`."""
+        """The log as it is observed, see `DeclaredLog`."""
         return self.declared.log
 
     @property
@@ -90,7 +98,7 @@ class Observation:
 
     @property
     def samples(self) -> int:
-        """How many there are to read."""
+        """The number of samples."""
         return len(self.log.t)
 
     @property
@@ -100,10 +108,12 @@ class Observation:
         return self.config.noise.velocity
 
     def strained(self) -> list[str]:
-        """Robots that ended ok but need more than half of the velocity bound: an error of the model may have taken it.
+        """Robots that end `ok` but need more than half of the velocity bound. An error of the model may hide in the
+        bound.
 
-        No alarm, since errors may be as large as declared. Not asked where it means nothing (the bound was found, sets
-        start again, the paper's set) or takes too long (theta is not planar).
+        This is no alarm, since errors may be as large as declared. The list is empty where the question has no meaning
+        (the bound was determined from the log, sets are reset, critical regions) or takes too long (theta is not
+        planar).
         """
         config, sets = self.config, self.sets
         if self.smallest_bounds is not None or config.on_inconsistent == "reset" or sets.kind == "critical_region":
@@ -116,10 +126,10 @@ class Observation:
         return [robot for robot, strained in zip(self.robots, needs_more.tolist(), strict=True) if strained]
 
     def run(self, out: Path, track: Track = iter) -> None:
-        """Observe the whole log; estimates.csv and regions.json go to the folder `out`, which is there.
+        """Observe the whole log. Write estimates.csv and regions.json into the existing folder `out`.
 
         Raises:
-            OSError: a file could not be written. The log was observed to its end all the same.
+            OSError: a file could not be written. The log was still observed to its end.
         """
         with ResultsWriter(out, self.robots, self.sets) as results:
             for measurement in track(self.declared.measurements()):
@@ -132,7 +142,7 @@ class Observation:
                     self._cases[robot].update([CASES[case]] if used else [])
 
     def verdicts(self) -> list[Verdict]:
-        """A line per robot, as things stand."""
+        """The present verdict on each robot."""
         sets = self.sets.feasible_set
         centre, radius = sets.chebyshev()
         volume, diameter, centroid = sets.volume(), sets.diameter(), sets.centroid()

@@ -1,4 +1,4 @@
-"""The two commands, from the path of a log to the last line that is printed."""
+"""The two commands on logs, from the path of a log to the last printed line."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ CHECKED = "check.json"
 
 
 def observe_log(path: Path, models: Mapping[str, ObserveConfig], folder: ResultsFolder) -> None:
-    """`torchfsid observe`: infer the sets of a log's robots, under one model or under each of several hypotheses.
+    """`torchfsid observe`: infer the sets of a log's robots, under one model or under several hypotheses.
 
-    What cannot be written or drawn is reported at the end: everything else is done before.
+    A file that cannot be written or drawn is reported at the end, after everything else is done.
     """
     use_one_thread()
     log = read_log(path, next(iter(models.values())).bag)
@@ -69,7 +69,7 @@ def observe_log(path: Path, models: Mapping[str, ObserveConfig], folder: Results
 
 
 def check_log(path: Path, models: Mapping[str, ObserveConfig], folder: ResultsFolder | None) -> None:
-    """`torchfsid check`: does a log fit the model, or each of the hypotheses, that is declared for it?"""
+    """`torchfsid check`: does a log fit its declared model, or each of the hypotheses?"""
     use_one_thread()
     log = read_log(path, next(iter(models.values())).bag)
     declared = {name: DeclaredLog(model, log) for name, model in models.items()}

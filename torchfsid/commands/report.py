@@ -1,4 +1,4 @@
-"""What the commands print: a line per robot, and in words what follows from it."""
+"""What the commands print: a line per robot, and the conclusions as sentences."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torchfsid.commands.terminal import digits, table
 
 
 def print_verdicts(observation: Observation, out: Path, console: Console) -> None:
-    """What became of each robot's set."""
+    """Print the final set of each robot."""
     numbers = ("skipped", "volume", "diameter", "centroid", "centre", "radius", "shrank last")
     verdicts = table(
         f"{len(observation.log.t)} samples, set: {observation.config.set}", ["robot", "cases"], [*numbers, "status"]
@@ -51,7 +51,7 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
 
 
 def print_hypotheses(hypotheses: Hypotheses, out: Path, console: Console) -> None:
-    """Which hypotheses are left for each robot, and what refuted the others."""
+    """Print which hypotheses are left for each robot, and what refuted the others."""
     names = list(hypotheses.observations)
     verdicts = table("which task is it?", ["robot", *names, "left"])
     for robot, of_robot in hypotheses.verdicts().items():
@@ -73,7 +73,13 @@ def print_hypotheses(hypotheses: Hypotheses, out: Path, console: Console) -> Non
 
 
 def print_check(found: Check, name: str, console: Console) -> None:
-    """The smallest bounds, what is at odds with the declared ones, and the conclusions; `name` of a hypothesis."""
+    """Print the smallest bounds, what contradicts the declared bounds, and the conclusions.
+
+    Args:
+        found: the result of `check`.
+        name: name of the hypothesis, or "".
+        console: where to print.
+    """
     robots = table(
         "smallest velocity bound and residuals [m/s]", ["robot"], ["bound", "median", "p95", "max", "at", "samples"]
     )
@@ -113,7 +119,7 @@ def _print_bound(console: Console, smallest: Mapping[str, float] | None, used: f
 
 
 def _rows(verdict: HypothesisVerdict) -> list[str]:
-    """The rows of the evidence, each once."""
+    """The labels of the rows in the evidence, each once."""
     return [escape(row) for row in dict.fromkeys(row for _, row in verdict.evidence)]
 
 
@@ -122,10 +128,10 @@ def _status(status: str) -> str:
 
 
 def _size(value: float) -> str:
-    """A size; a dash where there is none, as of an empty set."""
+    """The size as text. A dash if it is NaN, as that of an empty set."""
     return "-" if math.isnan(value) else f"{value:.3g}"
 
 
 def _point(values: Sequence[float], verdict: Verdict) -> str:
-    """Digits enough to find the point within its set."""
+    """The point as text, with enough digits to locate it within its set."""
     return "(" + ", ".join(digits(value, verdict.diameter) for value in values) + ")"

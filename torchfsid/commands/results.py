@@ -1,12 +1,13 @@
-"""The results folder: what a run leaves behind, in the files of the contract.
+"""The files that an observation writes into its results folder.
 
     config.yaml     the resolved configuration, from which the run can be repeated (`results_folder`)
-    estimates.csv   a row per robot and time, whole samples only, whatever ends the run
+    estimates.csv   one line per robot and time, whole samples only, however the run ends
     regions.json    the final set of every robot, rows A theta <= b
 
-Columns of estimates.csv: t, robot, case, n_active, then of the set volume, diameter, centre_i (Chebyshev), radius,
+Columns of estimates.csv: t, robot, case, n_active, then the set's volume, diameter, centre_i (Chebyshev), radius and
 centroid_i, then ukf_i, hybrid_i, status. Further sets follow with their name as prefix. `case` and `n_active` are empty
-where the robot was not measured, ukf_i and hybrid_i without a filter, sizes and centres of an empty set.
+where the robot was not measured. ukf_i and hybrid_i are empty without a filter. Sizes and centres of an empty set are
+empty.
 """
 
 from __future__ import annotations
@@ -34,15 +35,15 @@ STATUS_NAMES = {Status.OK: "ok", Status.ALARM: "alarm", Status.INCONSISTENT: "in
 
 
 class ResultsWriter:
-    """Writes estimates.csv while a run goes on, and regions.json on leaving, also when the run broke off.
+    """Writes estimates.csv during a run, and regions.json on leaving, also if the run is broken off.
 
-    Use it as a context manager. A file that cannot be written, as on a full disk, does not end the run: estimates.csv
+    Use it as a context manager. A file that cannot be written (full disk) does not end the run. estimates.csv then
     stops after its last whole sample, and the error is raised on leaving.
 
     Args:
-        out: the folder; made if it is not there.
+        out: the folder. It is made if it does not exist.
         robots: names of the inferred robots, in the order of the batch.
-        observer: whose final sets go to regions.json.
+        observer: the observer whose final sets go to regions.json.
         others: further observers, by the prefix of their columns.
     """
 
@@ -84,7 +85,7 @@ class ResultsWriter:
         estimate: HybridEstimate | SetEstimate,
         others: Mapping[str, SetEstimate] = MappingProxyType({}),
     ) -> None:
-        """One row per robot for the instant of `estimate`."""
+        """Write one line per robot for the time of `estimate`."""
         if self._problem is not None:
             return
         sets, blank = of_sets(estimate), [[""] * self.observer.feasible_set.dim] * len(self.robots)
@@ -106,7 +107,7 @@ class ResultsWriter:
         self._write_rows(rows)
 
     def _write_rows(self, rows: Sequence[Sequence[str]]) -> None:
-        """All of them or none, whatever happens meanwhile."""
+        """Write all lines or none, even if writing fails or is interrupted."""
         text = io.StringIO(newline="")
         csv.writer(text).writerows(rows)
         content, whole = text.getvalue().encode(), self._file.tell()
@@ -122,31 +123,31 @@ class ResultsWriter:
 
 
 def of_sets(estimate: HybridEstimate | SetEstimate) -> SetEstimate:
-    """What the sets say by themselves."""
+    """The estimate of the sets alone."""
     return estimate.set_estimate if isinstance(estimate, HybridEstimate) else estimate
 
 
 def set_columns(p: int) -> list[str]:
-    """Names of what `describe` returns."""
+    """Names of the columns that `describe` fills."""
     return ["volume", "diameter", *_indexed("centre", p), "radius", *_indexed("centroid", p)]
 
 
 def describe(sets: FeasibleSet) -> list[list[str]]:
-    """Volume, diameter, Chebyshev centre and radius, centroid of each set, as text; nothing where there is none."""
+    """Volume, diameter, Chebyshev centre and radius, centroid of each set, as text. Empty where a value is NaN."""
     centre, radius = sets.chebyshev()
     columns = [sets.volume()[:, None], sets.diameter()[:, None], centre, radius[:, None], sets.centroid()]
     return _texts(torch.cat(columns, dim=-1))
 
 
 class _Descriptions:
-    """`describe` sample after sample: only the sets that have changed are measured again."""
+    """`describe` for one sample after another. Only sets that have changed are measured again."""
 
     def __init__(self) -> None:
         self._texts: list[list[str]] = []
         self._last_cut = torch.empty(0)
 
     def __call__(self, sets: FeasibleSet) -> list[list[str]]:
-        last_cut = sets.last_cut.nan_to_num(nan=-math.inf)  # a set that starts again is the prior: never cut
+        last_cut = sets.last_cut.nan_to_num(nan=-math.inf)  # a set that is reset is the prior, which was never cut
         if not self._texts:
             self._texts = describe(sets)
         elif len(changed := (last_cut != self._last_cut).nonzero().flatten()):
@@ -157,22 +158,28 @@ class _Descriptions:
 
 
 def seconds(t: float) -> str:
-    """A time as text, to a tenth of a millisecond, also where it is counted from 1970."""
+    """A time [s] as text, rounded to 0.1 ms. This holds for times since 1970, too."""
     return f"{round(t, 4):.15g} s"
 
 
 def constraint_name(source: int, labels: Sequence[str]) -> str:
-    """What a `source` of `critical_region` or `inverse_optimal_set` stands for, given the labels of the rows."""
+    """The name of the constraint behind a `source` of `critical_region` or `inverse_optimal_set`.
+
+    Args:
+        source: the index.
+        labels: labels of the rows of the model.
+    """
     if source < 0:
         return "prior"
     return labels[source % len(labels)] if source < 2 * len(labels) else "nominal control"
 
 
 def regions(robots: Sequence[str], observer: SetMembershipObserver) -> dict:
-    """The final sets, as regions.json holds them; what is NaN here is null there.
+    """The content of regions.json: the final sets. NaN is null there.
 
-    `last_cut` is NaN where the set never shrank, and sizes and centres are where it is empty. `facets` tells when and
-    from which constraint each row came (`source` as in `critical_region` and `inverse_optimal_set`; -1: the prior).
+    `last_cut` is NaN if the set never shrank. Sizes and centres are NaN if the set is empty. `facets` says at which
+    time and from which constraint each row came (`source` as in `critical_region` and `inverse_optimal_set`, -1 for the
+    prior).
     """
     sets = observer.feasible_set
     facets, (centre, radius) = sets.facets(), sets.chebyshev()
@@ -212,7 +219,7 @@ def regions(robots: Sequence[str], observer: SetMembershipObserver) -> dict:
 
 
 def _without_repeats(vertices: Tensor) -> Tensor:
-    """Padding repeats the first vertex."""
+    """The vertices without padding, which repeats the first vertex."""
     repeats = (vertices == vertices[0]).all(-1)
     repeats[0] = False
     return vertices[~repeats]
@@ -223,7 +230,7 @@ def _indexed(name: str, p: int) -> list[str]:
 
 
 def _number(value: float) -> str:
-    """All digits that mean something; in the coordinates of a country, twelve of them would be hundredths of a mm."""
+    """The number as text, with 15 significant digits. With 12, map coordinates would end at hundredths of a mm."""
     return f"{value:.15g}" if math.isfinite(value) else ""
 
 

@@ -1,8 +1,8 @@
-"""The results folder: one owner at a time, never two runs mixed, and no file that is half written.
+"""The results folder: one owner at a time, never two runs mixed, and no half-written file.
 
 A folder belongs to the kind of command whose config.yaml it holds: `observe`, or the `kind` of an experiment. The file
-`.torchfsid` lists what was written there, a name a line, so that the next run of the same kind removes exactly that and
-nothing of anybody else's; it is locked as long as a command writes.
+`.torchfsid` lists the names of the files written there, one a line. The next run of the same kind removes exactly these
+files. `.torchfsid` is locked while a command writes.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torchfsid.errors import ConfigError
 
 try:
     import fcntl
-except ImportError:  # Windows: nobody keeps two commands apart there
+except ImportError:  # Windows: there is no lock there
     fcntl = None
 
 MANIFEST = ".torchfsid"
@@ -32,11 +32,11 @@ class ResultsFolder:
     """A folder that one command writes to.
 
     Args:
-        path: the folder; `claim` makes it.
-        kind: whose results it holds; None: any folder will do (the command adds files of its own to what is there).
+        path: the folder. `claim` makes it.
+        kind: the kind of results that it holds. None: any folder will do, and the command adds files to what is there.
 
     Attributes:
-        claimed: this command writes there now.
+        claimed: this command owns the folder now.
     """
 
     def __init__(self, path: Path, kind: str | None):
@@ -45,10 +45,11 @@ class ResultsFolder:
 
     @property
     def claimed(self) -> bool:
+        """Does this command own the folder now?"""
         return self._lock is not None
 
     def require_ours(self) -> None:
-        """Refuse a folder that is none, or that holds something else. Costs nothing: ask before the work begins.
+        """Check that the folder may be used. This is quick, so it comes before any work.
 
         Raises:
             ConfigError: `path` is not a folder, or holds the results of another kind of command.
@@ -64,12 +65,13 @@ class ResultsFolder:
         """Become the owner, remove what an earlier run left, and write config.yaml before anything else.
 
         Args:
-            files: names of everything that will be written, relative to the folder, "/" before a file of a subfolder.
+            files: names of all files that will be written, relative to the folder, with "/" after a subfolder.
             config: the content of config.yaml.
-            resume: go on with what is there, if its config.yaml is the same.
+            resume: keep what is there, if its config.yaml is the same.
 
         Raises:
-            ConfigError: see `require_ours`; or another command is writing there, or `resume` finds another config.
+            ConfigError: see `require_ours`. Also if another command is writing there, or `resume` finds another
+                config.yaml.
             OSError: the folder cannot be made or written to.
         """
         self.require_ours()
@@ -88,7 +90,9 @@ class ResultsFolder:
         listed = lock.read().decode(errors="replace").splitlines()
         names = [*(["config.yaml"] if config is not None else []), *files]
         if not resume:
-            mine = names if self.kind is None else [*listed, *names]  # who only adds to a folder replaces its own
+            mine = (
+                names if self.kind is None else [*listed, *names]
+            )  # a command that adds to a folder replaces its own files only
             for name in dict.fromkeys(mine):
                 self._remove(name)
             listed = [name for name in listed if name not in mine]
@@ -100,13 +104,16 @@ class ResultsFolder:
             write_whole(self.path / "config.yaml", config)
 
     def release(self) -> None:
-        """Give the folder back."""
+        """Give up the ownership."""
         if self._lock is not None:
             self._lock.close()
             self._lock = None
 
     def _kind_held(self) -> str | None:
-        """The kind of command whose config.yaml the folder holds; "" if no command wrote it, None if there is none."""
+        """The kind of command whose config.yaml the folder holds.
+
+        It is "" if no command wrote the file, and None if there is no such file.
+        """
         from torchfsid.config.documents import read_yaml
 
         path = self.path / "config.yaml"
@@ -120,7 +127,7 @@ class ResultsFolder:
         return str(content.get("kind", OBSERVE if of_observe else ""))
 
     def _remove(self, name: str) -> None:
-        """A file of ours, and its subfolder if nothing else is in it."""
+        """Remove a file of this command, and its subfolder if that is then empty."""
         relative = PurePosixPath(name)
         if not name or relative.is_absolute() or ".." in relative.parts:
             return
@@ -133,7 +140,11 @@ class ResultsFolder:
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
-    """Write a file whole or not at all."""
+    """Write a file whole or not at all.
+
+    Raises:
+        OSError: it cannot be written. The file at `path` is then unchanged.
+    """
     partial = path.with_name(path.name + ".partial")
     try:
         with named(path):
@@ -145,13 +156,13 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 
 def write_json(path: Path, content: object) -> None:
-    """Write a JSON file whole or not at all; numbers that are not finite, which JSON does not know, become null."""
+    """Write a JSON file whole or not at all. Numbers that are not finite become null, because JSON has none."""
     write_whole(path, json.dumps(_finite(content), indent=1, allow_nan=False) + "\n")
 
 
 @contextmanager
 def named(path: Path) -> Iterator[None]:
-    """An error of the operating system that does not say which file it is about gets the file's name."""
+    """In this block an error of the operating system that names no file gets the name of this file."""
     try:
         yield
     except OSError as error:

@@ -1,6 +1,6 @@
-"""What commands show: tables on stdout, how far they have come on stderr.
+"""What commands show: tables on stdout, progress on stderr.
 
-Nothing that is shown decides whether the work is done: a reader who leaves (`| head`) ends the printing and no more.
+Showing never decides whether the work is done. A reader that leaves (`| head`) ends the printing only.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class _Console(Console):
 
 
 class _Aside:
-    """stderr, as long as it takes something: what cannot be shown there stops nothing."""
+    """stderr, except that what cannot be shown there raises no error."""
 
     def __init__(self) -> None:
         self._stream = sys.stderr
@@ -51,19 +51,19 @@ class _Aside:
 
 
 def console(least_width: int = 0) -> Console:
-    """stdout; tables that need more columns than a terminal has are wrapped by the terminal."""
+    """A console on stdout. Tables that need more columns than the terminal has are wrapped by the terminal."""
     made = _Console()
     made.width = max(made.width if made.is_terminal else WIDTH, least_width)
     return made
 
 
 def aside() -> Console:
-    """stderr."""
+    """A console on stderr."""
     return Console(file=cast(IO[str], _Aside()))
 
 
 def table(title: str, texts: Sequence[str], numbers: Sequence[str] = ()) -> Table:
-    """Columns of texts, then of numbers, which wrap where a terminal is narrow: no digit is ever cut off."""
+    """A table with columns of texts, then of numbers. Cells wrap in a narrow terminal, and no digit is cut off."""
     made = Table(title=title, title_justify="left")
     for heading in texts:
         made.add_column(heading, no_wrap=True)
@@ -73,11 +73,13 @@ def table(title: str, texts: Sequence[str], numbers: Sequence[str] = ()) -> Tabl
 
 
 def track(items: Iterable[Item], what: str, total: int, finished: int = 0) -> Iterator[Item]:
-    """Pass items on, and show how far they have come.
+    """Pass items on and show progress.
 
     Args:
-        what: is done with them.
-        total: how many there are, with those `finished` before.
+        items: the items.
+        what: what is done with them, for the progress line.
+        total: number of all items, the `finished` ones included.
+        finished: number of items that were done before.
     """
     shown = aside()
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
@@ -92,7 +94,12 @@ def track(items: Iterable[Item], what: str, total: int, finished: int = 0) -> It
 
 @contextlib.contextmanager
 def status(what: str, computes: bool = False) -> Iterator[None]:
-    """Show that something is being done whose end is not known; does it use the compiled kernels?"""
+    """In this block show that something is being done whose length is not known.
+
+    Args:
+        what: what is being done.
+        computes: it uses the compiled kernels, which may have to be compiled first.
+    """
     shown = aside()
     with shown.status(_first(what, shown) if computes else what):
         yield
@@ -101,8 +108,10 @@ def status(what: str, computes: bool = False) -> Iterator[None]:
 
 
 def digits(value: float, resolution: float) -> str:
-    """A number with at least four digits, and with as many as tell apart what is a tenth of `resolution` apart;
-    a dash for NaN, of which there is nothing to say."""
+    """A number as text, with at least four digits, and enough to show differences of a tenth of `resolution`.
+
+    NaN is a dash.
+    """
     if math.isnan(value):
         return "-"
     enough, size = 4, abs(value)
@@ -113,7 +122,7 @@ def digits(value: float, resolution: float) -> str:
 
 
 def _first(what: str, shown: Console) -> str:
-    """What to show while the first item is worked on: kernels are compiled when they are first used."""
+    """The text to show during the first item: kernels are compiled when they are first used."""
     from torchfsid.kernels.compiled import folder
 
     if (folder() / "complete").exists():
