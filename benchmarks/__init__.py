@@ -1,6 +1,6 @@
 """Benchmarks: torchfsid and its peers on the same work, in the same run. `python -m benchmarks NAME`.
 
-Each benchmark is a module with `main(arguments)`; it prints its table and saves what it measured under `results/`.
+Each benchmark is a module with `main(arguments)`. It prints its table and saves its results under `results/`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ RESULTS = Path(__file__).parent / "results"
 
 
 def save(name: str, results: Any, packages: list[str]) -> Path:
-    """`results` (anything JSON holds) with the versions that gave them, in results/NAME.json."""
+    """Save `results` (anything JSON holds) with the versions of the packages, in results/NAME.json."""
     path = RESULTS / f"{name}.json"
     versions = {"python": platform.python_version(), **{package: version(package) for package in sorted(packages)}}
     path.parent.mkdir(exist_ok=True)

@@ -1,10 +1,12 @@
 """python -m benchmarks fleet [--steps 40] [--long 10000]
 
 The whole observer update (rows from positions, active set, KKT conditions, half-spaces, clipping) for fleets of 1 to
-100 000 robots with 8 neighbours each (`scenario`), from the prior on: robot-updates per second of CPU time on one
-thread; ten fleets of 1000, so that each size has its share of robots. The search of the neighbours, which the observer
-does not do, is given beside it. Then the same robots observed among more or fewer neighbours, one robot, update by
-update, and a fleet over many steps, whose cost must not grow.
+100 000 robots with 8 neighbours each (`scenario`), starting from the prior. The result is robot-updates per second of
+CPU time on one thread. The search of the neighbours is not part of the observer and is timed separately. Ten fleets of
+1000 robots give that size as many robots as the others.
+
+Further tables: the same robots among more or fewer neighbours; one robot, update by update; and a fleet over many
+steps, whose cost must not grow.
 """
 
 from __future__ import annotations
@@ -27,14 +29,14 @@ CROWDS = (4, 8, 16, 32)
 
 
 def _blocks(fleet: Fleet, steps: int) -> Iterator[list[tuple[float, Tensor, Tensor]]]:
-    """What is measured, some instants at a time: the simulation of the robots does not empty the observer's caches."""
+    """The measurements in blocks of some times. Simulating a block at once leaves the observer's caches alone."""
     moments = itertools.islice(fleet, steps)
     while block := list(itertools.islice(moments, BLOCK)):
         yield block
 
 
 def run(robots: int, steps: int, noisy: bool, compiled: bool, fleets: int = 1, neighbours: int = NEIGHBOURS) -> dict:
-    """Some fleets from the prior on, one after the other; times per robot and update [us]."""
+    """Observe some fleets from the prior on, one after the other. Times are per robot and update [us]."""
     spent, search, cut, used, active, lost = [], 0.0, 0, 0, 0, 0
     for seed in range(fleets):
         fleet = Fleet(robots, noisy, seed)
@@ -73,7 +75,7 @@ def run(robots: int, steps: int, noisy: bool, compiled: bool, fleets: int = 1, n
 
 
 def run_alone(steps: int, compiled: bool) -> dict:
-    """One robot among nine, update by update [us]: wall-clock time, which is what its user waits for."""
+    """Observe one robot among nine. Wall-clock times of single updates [us], which are what its user waits for."""
     fleet, spent = Fleet(NEIGHBOURS + 1), []
     watching = observer(fleet.prior().select(torch.tensor([0])), compiled)
     for t, x, u in itertools.islice(fleet, steps):
@@ -84,7 +86,7 @@ def run_alone(steps: int, compiled: bool) -> dict:
 
 
 def run_long(robots: int, steps: int, compiled: bool) -> dict:
-    """Cost per robot and update [us] and slots of the sets along a long run, in ten pieces."""
+    """Cost per robot and update [us], and slots of the sets, along a long run in ten parts."""
     fleet, spent, slots = Fleet(robots, noisy=True), [], []
     watching = observer(fleet.prior(), compiled)
     for t, x, u in itertools.islice(fleet, steps):
@@ -112,7 +114,7 @@ def main(arguments: list[str]) -> None:
     ways = {"torch": False, "compiled": True}
     results: dict = {"neighbours": NEIGHBOURS}
     for way, compiled in ways.items():
-        run(1000, 2, True, compiled)  # compile, and load what loads late
+        run(1000, 2, True, compiled)  # compile the kernels and load lazy modules
         sizes = [(robots, noisy) for noisy in (False, True) for robots in SIZES if robots <= options.largest]
         rows = [run(B, options.steps, noisy, compiled, max(1, LEAST // B)) for B, noisy in sizes]
         crowds = [run(1000, options.steps, True, compiled, LEAST // 1000, M) for M in CROWDS]

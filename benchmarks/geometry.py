@@ -1,16 +1,16 @@
 """python -m benchmarks geometry [--batch 10000] [--updates 300]
 
-The region in the plane: [-10, 10]^2 and 300 updates of 6 half-spaces; each update intersects, drops redundant rows and
-asks for area, vertices and the Chebyshev centre. torchfsid updates a batch of sets, its peers the first set of the same
-batch, one at a time; times are CPU times of one thread, per set and update.
+Sets in the plane: [-10, 10]^2 and 300 updates of 6 half-spaces. Each update intersects, drops redundant rows and asks
+for area, vertices and the Chebyshev centre. torchfsid updates a batch of sets. Its peers update the first set of the
+same batch, one at a time. Times are CPU times of one thread, per set and update.
 
-The workload. A truth uniform in [-5, 5]^2, rows of random directions at distances (0.2 .. 1) w_k from it, with w_k =
-10, 9.8, ... down to 0.02: most updates cut. `thin`: from the second update on, two of the six rows face each other at
-a distance `width`, turned by up to a quarter of it, so that sets are needles that go on being cut.
+The workload. A truth is uniform in [-5, 5]^2. Rows have random directions, at distances (0.2 .. 1) w_k from it, with
+w_k = 10, 9.8, ... down to 0.02: most updates cut. In `thin`, from the second update on, two of the six rows face each
+other at a distance `width`, turned by up to a quarter of it. So sets are needles that go on being cut.
 
-What counts as a failure of an update, against the same update in exact rationals: an exception, an empty or unbounded
-answer, the truth excluded by the vertices' hull, an area off by more than 1 %. After one the peer starts again from the
-exact set, so that no update pays for another's mistake.
+An update fails, against the same update in exact rationals, by an exception, an empty or unbounded answer, a truth
+outside the hull of the vertices, or an area that is off by more than 1 %. After a failure the peer starts again from
+the exact set, so that no update is blamed for an earlier one.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def workload(batch: int, updates: int, width: float | None, seed: int = 0) -> It
 
 
 class Exact:
-    """The set in rationals: a ring of vertices, each with the row of the edge that it starts."""
+    """The set in rationals: a ring of vertices, each with the row of the edge that starts there."""
 
     def __init__(self) -> None:
         corners = [(-10, -10), (10, -10), (10, 10), (-10, 10)]
@@ -99,7 +99,7 @@ class Exact:
 
 
 class Ours:
-    """One set at a time, to be judged as the peers are."""
+    """torchfsid with one set at a time, judged as the peers are."""
 
     def start(self, A: np.ndarray, b: np.ndarray) -> None:
         corner = torch.full((1, 2), 10.0, dtype=torch.float64)
@@ -113,20 +113,20 @@ class Ours:
 
 
 def judge(answer: Answer, area: float, truth: np.ndarray) -> str | None:
-    """What is wrong with an answer; None: nothing."""
+    """What is wrong with an answer, in words. None if it is right."""
     found, ring, _ = answer
     if not np.isfinite(found) or len(ring) < 3:
         return "empty"
     start, end = ring - truth, np.roll(ring, -1, axis=0) - truth
     turn = start[:, 0] * end[:, 1] - start[:, 1] * end[:, 0]
     across = turn * np.sign(turn.sum()) / np.maximum(np.linalg.norm(end - start, axis=1), 1e-300)
-    if across.min() < -1e-13:  # the truth is beyond an edge, by more than the round-off of coordinates of size 10
+    if across.min() < -1e-13:  # the truth is outside, by more than the round-off of coordinates of size 10
         return "truth lost"
     return "area" if abs(found - area) > WRONG * area else None
 
 
 def run_alone(make: Callable, rows: list[Rows], truth: np.ndarray) -> dict:
-    """CPU time, failures and errors of one set, update by update."""
+    """CPU times, failures and errors of one set, update by update."""
     exact, peer, spent, failures, errors = Exact(), make(), [], Counter(), []
     peer.start(*BOX)
     for A, b in rows:
@@ -136,7 +136,7 @@ def run_alone(make: Callable, rows: list[Rows], truth: np.ndarray) -> dict:
             answer = peer.update(A, b)
             spent.append(time.process_time() - began)
             failure = judge(answer, area, truth)
-        except Exception as error:  # whatever a library may raise is its answer
+        except Exception as error:  # any exception of a library is its answer
             answer, failure = None, type(error).__name__
         if failure is None:
             assert answer is not None
@@ -154,7 +154,7 @@ def run_alone(make: Callable, rows: list[Rows], truth: np.ndarray) -> dict:
 
 
 def run_batch(batch: int, updates: int, width: float | None) -> dict:
-    """CPU time of a batch, per set and update; truths lost."""
+    """CPU time of a batch, per set and update [s], and the number of lost truths."""
     corner = torch.full((batch, 2), 10.0, dtype=torch.float64)
     sets, truth, spent, cut = FeasibleSet.from_box(-corner, corner), torch.from_numpy(truths(batch, 0)), 0.0, 0
     for k, (A, b) in enumerate(workload(batch, updates, width)):

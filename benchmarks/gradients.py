@@ -1,17 +1,17 @@
 """python -m benchmarks gradients [--repeats 5]
 
-What a gradient through Theta costs, and whether it is right.
+The cost and the error of gradients through Theta.
 
-clips: the mean over B sets of log(area) after 20 clips of 16 rows, and its gradient with respect to all rows. A goal
-uniform in [-5, 5]^2, the prior [-10, 10]^2, rows of random directions at distances (0.2 .. 1) 10 0.9^k from the goal.
-torchfsid (compiled clips, then implicit derivatives) against the same clips with every step in torch
-(tests/reference_clip.py). Times are CPU times of one thread for value and gradient, the fastest of some
-repetitions. Errors are those of the derivative along a random direction, relative to the gradient's norm, against
-central differences.
+clips: the mean over B sets of log(area) after 20 clips of 16 rows, and its gradient with respect to all rows. A goal is
+uniform in [-5, 5]^2, and the prior is [-10, 10]^2. Rows have random directions, at distances (0.2 .. 1) 10 0.9^k from
+the goal. torchfsid (compiled clips and implicit differentiation) is compared with the same clips in torch
+(tests/reference_clip.py). Times are CPU times of one thread for value and gradient, the fastest of some repetitions.
+Errors are those of the derivative along a random direction against central differences, relative to the gradient's
+norm.
 
-probe: one gradient step of the probe design (configs/probe_placement.yaml, paths of 3 way-points): mean log-area of
+probe: one gradient step of the probe design (configs/probe_placement.yaml, paths of 3 way-points): the mean log-area of
 Theta(T) over placements and goals through closed loop, evidence and clips, and its gradient with respect to the
-placements. `Probing.left` against the same with every sample read and clipped in torch as it comes.
+placements. `Probing.left` is compared with reading and clipping every sample in torch.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def gradient(mean: Callable[[Rows], Tensor], rows: Rows) -> Rows:
 def measured(
     mean: Callable[[Rows], Tensor], rows: Rows, along: Rows, difference: float, repeats: int
 ) -> dict[str, float]:
-    """CPU seconds of a gradient, and its error along a direction."""
+    """CPU time of a gradient [s], and its error along a direction."""
     spent = []
     for _ in range(repeats + 1):  # the first one compiles
         began = time.process_time()

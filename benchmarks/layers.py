@@ -43,7 +43,17 @@ Programme = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Measured:
-    """Medians over the repeats [s] and the largest errors; NaN: it failed."""
+    """Medians over the repeats, and the largest errors. NaN: the solver failed.
+
+    Attributes:
+        problem: the problem.
+        solver: the solver.
+        rows: number of rows m.
+        batch: number of sets B.
+        seconds: time for forward and backward [s].
+        error: largest error of the answers.
+        gradient_error: largest error of the gradients.
+    """
 
     problem: str
     solver: str
@@ -55,8 +65,11 @@ class Measured:
 
 
 def workload(m: int, B: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Unit rows A, the first three 120 degrees apart, so that no set is unbounded, at which cvxpylayers fails for the
-    whole batch; offsets b in [0.5, 1.5] and points y, most of them outside."""
+    """Random half-planes A z <= b and points y.
+
+    The first three of the unit rows A are 120 degrees apart, so that no set is unbounded. cvxpylayers fails for the
+    whole batch if one is. Offsets b are in [0.5, 1.5]. Most of the points y are outside.
+    """
     rng = np.random.default_rng(m)
     angle = rng.uniform(0, 2 * np.pi, (B, m))
     angle[:, :3] = angle[:, :1] + np.arange(3) * 2 * np.pi / 3
@@ -66,7 +79,7 @@ def workload(m: int, B: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def weighted(problem: str, answer: Tensor) -> Tensor:
-    """What is differentiated; of the ball, (centre, radius) in one."""
+    """The weighted sum that is differentiated. The answer for the ball is (centre, radius) in one tensor."""
     weights = {"projection": (1.0, -0.5), "chebyshev": (1.0, -0.5, 2.0)}[problem]
     return answer @ torch.tensor(weights, dtype=torch.float64)
 
@@ -122,7 +135,7 @@ def solvers(problem: str) -> dict[str, Programme]:
 
 
 def solve_rational(M: list[list[Fraction]], right: list[Fraction]) -> list[Fraction] | None:
-    """Gauss and Jordan; None: singular."""
+    """Solve M x = right by Gauss-Jordan elimination. None if M is singular."""
     rows = [[*row, value] for row, value in zip(M, right, strict=True)]
     for i in range(len(rows)):
         pivot = next((row for row in rows[i:] if row[i] != 0), None)
@@ -135,9 +148,9 @@ def solve_rational(M: list[list[Fraction]], right: list[Fraction]) -> list[Fract
 
 
 def reference(problem: str, A: np.ndarray, b: np.ndarray, y: np.ndarray) -> tuple[list[float], list[int]]:
-    """The answer and its active rows, by trying subsets of the rows nearest to the answer, in rational arithmetic.
+    """The answer and its active rows in rational arithmetic, by trying subsets of the rows nearest to the answer.
 
-    For the ball |a| is the double that its rounded root is, as the solvers get it.
+    For the ball |a| is the rounded root as a double, as the solvers get it.
     """
     order = candidates(problem, A, b, y)
     rows = {j: [Fraction(float(v)) for v in A[j]] for j in range(len(b))}
@@ -167,7 +180,7 @@ def reference(problem: str, A: np.ndarray, b: np.ndarray, y: np.ndarray) -> tupl
 
 
 def candidates(problem: str, A: np.ndarray, b: np.ndarray, y: np.ndarray) -> list[int]:
-    """The rows nearest to a conic solver's answer (Clarabel): a hint, whose use is checked in rationals."""
+    """The rows nearest to the answer of a conic solver (Clarabel): only a hint, which is checked in rationals."""
     z, r = cp.Variable(2), cp.Variable()
     if problem == "projection":
         cp.Problem(cp.Minimize(cp.sum_squares(z - y)), [A @ z <= b]).solve(solver="CLARABEL")
@@ -180,7 +193,7 @@ def candidates(problem: str, A: np.ndarray, b: np.ndarray, y: np.ndarray) -> lis
 
 
 def gradient_of(problem: str, A: Tensor, b: Tensor, y: Tensor, active: list[int]) -> list[Tensor]:
-    """The derivative of the solution of the active rows, by autograd through one solve of their KKT matrix."""
+    """The gradients of the solution with respect to the rows, by autograd through one solve of the KKT matrix."""
     A, b, y = (t.detach().requires_grad_() for t in (A, b, y))
     N, right = A[active], b[active]
     if problem == "chebyshev":
@@ -207,7 +220,7 @@ def right_answers(problem: str, m: int, B: int) -> list[tuple[list[float], list[
 
 
 def measure(problem: str, name: str, solver: Programme, m: int, B: int, seconds: float) -> Measured:
-    """Repeat for about so many seconds, after one run to warm up, whose answers are checked."""
+    """Time the solver for about this number of seconds. A first run warms up, and its answers are checked."""
     inputs = workload(m, B)
 
     def once() -> tuple[Tensor, tuple[Tensor, ...]]:

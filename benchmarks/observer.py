@@ -1,8 +1,9 @@
 """python -m benchmarks observer [--fleets 20]
 
-One update of each observer on the same measurements of the same robots (`scenario`, noisy): the sets compiled and in
-torch, filterpy's UKF on [x; theta], and the hybrid of both, for 1, 10 and 100 robots, in some fleets. Wall-clock time
-per robot and update [us], the median over all updates, and how far each is from the goals at the end.
+One update of each observer on the same measurements of the same robots (`scenario`, noisy), for 1, 10 and 100 robots in
+some fleets. The observers are the sets (compiled, and in torch), filterpy's UKF on [x; theta], and the hybrid of both.
+Results are the wall-clock time per robot and update [us], the median over all updates, and the final distance to the
+goals.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ def makers(fleet: Fleet, robots: range) -> dict[str, Callable[[], Observer]]:
 
 
 def run(robots: int, fleets: int) -> dict[str, dict]:
-    """Some fleets, each until its robots are put to new places, which a filter would take for a motion."""
+    """Observe some fleets, each until its robots are moved to new places, which a filter would take for a motion."""
     watched = range(robots)
     spent: dict[str, list[float]] = defaultdict(list)
     errors: dict[str, list[float]] = defaultdict(list)
@@ -79,7 +80,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--fleets", type=int, default=20)
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    run(1, 1)  # compile, and load what loads late
+    run(1, 1)  # compile the kernels and load lazy modules
     results: dict = {"fleets": options.fleets, "updates": EPISODE, "sizes": {}}
     for robots in SIZES:
         found = results["sizes"][robots] = run(robots, options.fleets)

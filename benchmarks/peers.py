@@ -1,8 +1,8 @@
-"""Other libraries' way to do one update of one set in the plane: {z : A z <= b} after more rows.
+"""Updates of one set {z : A z <= b} in the plane by other libraries.
 
-Each peer is a class: `start(A, b)` begins with irredundant rows, `update(A, b)` intersects, drops redundant rows and
-returns (area, vertices, Chebyshev centre). They are used as their manuals say, with default tolerances. pycddlib and
-pypoman are GPL and are only run here, never imported by the package.
+Each peer is a class. `start(A, b)` begins with irredundant rows. `update(A, b)` intersects, drops redundant rows and
+returns (area, vertices, Chebyshev centre). Peers are used as their manuals say, with default tolerances. pycddlib and
+pypoman are GPL. They are only run here, never imported by the package.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ BOX = np.array([[-1.0, 0], [1, 0], [0, -1], [0, 1]]), np.full(4, 10.0)
 
 
 def _hull(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Points of a convex polygon in order, and its area."""
+    """The points of a convex polygon in order, and its area."""
     spokes = points - points.mean(0)
     ring = points[np.argsort(np.arctan2(spokes[:, 1], spokes[:, 0]))]
     x, y = (ring - ring[0]).T
@@ -25,7 +25,10 @@ def _hull(points: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 class Shapely:
-    """Half-planes are large boxes. The centre is GEOS's inscribed circle, to its default tolerance (size/1000)."""
+    """Shapely: half-planes are large boxes.
+
+    The centre is that of GEOS's inscribed circle, with its default tolerance (size/1000).
+    """
 
     packages = ("shapely",)
 
@@ -49,7 +52,7 @@ class Shapely:
 
 
 class Scipy:
-    """Chebyshev centre by HiGHS, vertices and redundant rows by Qhull about it."""
+    """SciPy: the Chebyshev centre by HiGHS, vertices and redundant rows by Qhull about it."""
 
     packages = ("scipy",)
 
@@ -70,7 +73,7 @@ class Scipy:
 
 
 class Cdd:
-    """Redundancy, double description and the linear programme of cddlib, in floats."""
+    """pycddlib: redundancy, double description and the linear programme of cddlib, in floats."""
 
     packages = ("pycddlib-standalone",)
 
@@ -95,7 +98,7 @@ class Cdd:
 
 
 class Pypoman:
-    """Its vertices (by cddlib) and Chebyshev centre (by its linear programme); rows from the vertices."""
+    """pypoman: vertices (by cddlib) and Chebyshev centre (by its linear programme). Rows follow from the vertices."""
 
     packages = ("pypoman",)
 
@@ -113,7 +116,7 @@ class Pypoman:
 
 
 class PolytopeToolbox:
-    """intersect, reduce, volume, extreme and chebXc of `polytope`."""
+    """polytope: its intersect, reduce, volume, extreme and chebXc."""
 
     packages = ("polytope",)
 

@@ -1,4 +1,4 @@
-"""python -m benchmarks.report: docs/benchmarks.md from the saved results, results/*.json, and from nothing else."""
+"""python -m benchmarks.report: write docs/benchmarks.md from the saved results (results/*.json) alone."""
 
 from __future__ import annotations
 

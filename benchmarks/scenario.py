@@ -1,10 +1,9 @@
-"""The fleet that `fleet` and `observer` watch: robots on a square, 4 m^2 each, going to goals past each other.
+"""The fleet of the benchmarks `fleet` and `observer`: robots on a square, 4 m^2 each, going to goals past each other.
 
-Each robot avoids its 8 nearest bodies by the paper's rows (gain 1.5, Ds 0.4 m) and its control solves its QP exactly.
-The declared bound is 5 mm/s. `noisy` controls are measured with an error anywhere in a disc of this radius, which goes
-on cutting the sets at most steps; others exactly, as a simulator logs them, which cuts them at the first ones. Every 40
-steps of 0.05 s all robots are put to new places while their goals stay, so that a run can go on for as long as one
-likes. Everything is seeded.
+Each robot avoids its 8 nearest bodies by the paper's rows (gain 1.5, Ds 0.4 m), and its control solves its QP exactly.
+The declared bound is 5 mm/s. `noisy` controls have an error in a disc of this radius, and sets are cut at most steps.
+Other controls are exact, as in a simulator's log, and sets are cut at the first steps only. Every 40 steps of 0.05 s
+all robots are moved to new places while their goals stay, so that a run can be of any length. Everything is seeded.
 """
 
 from __future__ import annotations
@@ -28,8 +27,11 @@ TASK, BARRIER = GoalTask(0.9), CollisionAvoidance(ClassK(1.5), safety_distance=0
 
 
 def solve_qp(A: Tensor, b: Tensor, nominal: Tensor) -> Tensor:
-    """argmin |u - nominal|^2 s.t. A u <= b: the best of the feasible projections onto no row, one row, two rows; zero,
-    as controllers do, where there is none."""
+    """argmin |u - nominal|^2 s.t. A u <= b, row by row.
+
+    It is the best of the feasible projections onto no row, one row, two rows. Where there is none it is zero, as
+    controllers do.
+    """
     m = b.shape[1]
     i, j = torch.triu_indices(m, m, 1)
     beyond = (A @ nominal.unsqueeze(-1)).squeeze(-1) - b
@@ -45,7 +47,7 @@ def solve_qp(A: Tensor, b: Tensor, nominal: Tensor) -> Tensor:
 
 
 class Fleet:
-    """The robots. Iterating gives, without end, the positions and the measured controls."""
+    """The robots. Iterating gives time, positions and measured controls, without end."""
 
     def __init__(self, robots: int, noisy: bool = False, seed: int = 0) -> None:
         self.error = ERROR if noisy else 0.0
@@ -53,7 +55,7 @@ class Fleet:
         self.goals = self._places(robots)
 
     def _places(self, robots: int) -> Tensor:
-        """One in each cell of a grid of 2 m, in random order: nobody starts closer than 0.5 m to another."""
+        """One place in each cell of a grid of 2 m, in random order. No two are closer than 0.5 m."""
         side = int(self.half)
         cell = self.rng.permutation(side * side)[:robots]
         corner = np.stack([cell % side, cell // side], axis=-1) * 2.0 - self.half

@@ -1,7 +1,7 @@
-"""The command line: `python -m experiments run CONFIG --out DIR`, `... sweep ...`, `... design ...`, `... figures DIR`.
+"""The command line: `python -m experiments {run, sweep, design} CONFIG --out DIR`, `python -m experiments figures DIR`.
 
-Everything is validated before PyTorch is loaded and before anything is written: a mistake costs one clear line on
-stderr and exit code 2.
+Everything is validated before PyTorch is loaded and before anything is written. A mistake gives one line on stderr and
+exit code 2.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torchfsid.commands.results_folder import ResultsFolder
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code."""
+    """Run the command line and return the exit code (`torchfsid.commands.command_line` lists them)."""
     parser = Parser(prog="experiments", description="The paper's experiments: results first, figures from them.")
     commands = parser.add_subparsers(dest="command", required=True)
     run = commands.add_parser("run", help="run an experiment and draw its figures")

@@ -1,4 +1,4 @@
-"""The kinds of configuration files: one table of what is done with each.
+"""The kinds of configuration files, in one table of what is done with each.
 
 Its functions are imported when they are called, so that a mistake in a file is found before PyTorch is loaded.
 """
@@ -27,7 +27,12 @@ Track = Callable[..., Iterable[Any]]
 
 @dataclass(frozen=True)
 class Later:
-    """A function of `experiments`, imported when it is called."""
+    """A function of `experiments` that is imported when it is called.
+
+    Attributes:
+        module: its module.
+        name: its name.
+    """
 
     module: str
     name: str
@@ -41,11 +46,11 @@ class Kind:
     """What is done with the files of a kind.
 
     Attributes:
-        command: of `python -m experiments`, for which these files are.
-        config: the record of such a file.
-        run: (config, folder, track) -> summary. Writes the results into the folder, all but summary and figures.
-        show: (summary, console) -> nothing. Prints what the results show.
-        draw: (folder, config) -> (name, figure or film) pairs. Draws from the files of the folder.
+        command: the command of `python -m experiments` that takes these files.
+        config: the class of the configuration.
+        run: (config, folder, track) -> summary. Writes all results but the summary and the figures into the folder.
+        show: (summary, console) -> None. Prints the summary.
+        draw: (folder, config) -> pairs of a name and a figure or film, drawn from the files of the folder.
     """
 
     command: Command
@@ -102,13 +107,15 @@ KINDS = {
 
 
 def load(path: str | Path, overrides: Sequence[str] = (), command: Command | None = None) -> Config:
-    """The configuration in a file, after `overrides` such as "noise.velocity=0.02".
+    """The configuration in a file.
 
     Args:
-        command: for which it has to be; None: for any.
+        path: the YAML file.
+        overrides: texts such as "noise.velocity=0.02".
+        command: the command that the file must be for. None: any command.
 
     Raises:
-        ConfigError: the file is none, or of a kind for another command.
+        ConfigError: the file is not valid, or is of a kind for another command.
     """
     mapping = read_yaml(path)
     mapping = (override_sweep if mapping.get("kind") == "sweep" else apply_overrides)(mapping, overrides)

@@ -1,7 +1,7 @@
-"""Results folders: the one table of what stands in them, and how their files are written and read. No torch here.
+"""Results folders: one table of their files, and how these are written and read. This module does not import torch.
 
-Every file is written line by line, or aside and then renamed: it is whole, or it ends where the run broke off. Figures
-and summaries come from these files alone.
+A file is written line by line, or aside and then renamed. So it is whole, or it ends where the run broke off. Figures
+and summaries are made from these files alone.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ class File(NamedTuple):
     """A file of a results folder.
 
     Attributes:
-        name: in the folder.
+        name: its name in the folder.
         writer: the module that writes it.
-        reader: the module that reads it back for the figures; none: it is for people, and for other programmes.
-        holds: what is in it.
+        reader: the module that reads it back for the figures. None: it is for people and other programmes only.
+        holds: its content, in words.
     """
 
     name: str
@@ -104,12 +104,16 @@ FIGURES = ("figure.png", "figure.pdf", "comparison.png", "comparison.pdf", "anim
 
 
 def names(kind: str) -> list[str]:
-    """The files of a kind, and its figures."""
+    """The names of the files and figures of a kind."""
     return [*(file.name for file in FILES[kind]), *FIGURES]
 
 
 def require(folder: Path, kind: str) -> None:
-    """Raises `FigureError` for the first file that the figures of this kind need and the folder does not have."""
+    """Check that the folder has the files that the figures of this kind need.
+
+    Raises:
+        FigureError: a file is missing. The message names the first one.
+    """
     for file in FILES[kind]:
         if file.reader and not (folder / file.name).is_file():
             raise FigureError(f"{folder / file.name}: is missing: the run has not come that far, or it was removed")
@@ -117,7 +121,7 @@ def require(folder: Path, kind: str) -> None:
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """What goes wrong with the content of a file in this block is the file's fault, and is said so."""
+    """In this block an error in the content of a file is raised as a `FigureError` that names the file."""
     try:
         yield
     except FileNotFoundError as error:
@@ -129,16 +133,22 @@ def reading(path: Path) -> Iterator[None]:
 
 
 def damaged(path: Path, what: str) -> NoReturn:
+    """Raise the `FigureError` for a damaged file."""
     raise FigureError(f"{path}: is damaged: {what}")
 
 
 def require_length(path: Path, lines: int, expected: int) -> None:
+    """Check the number of lines of a file.
+
+    Raises:
+        FigureError: it has other than the expected number.
+    """
     if lines != expected:
         raise FigureError(f"{path}: has {lines} of {expected} rows: the run broke off, or some were removed")
 
 
 class Columns(dict[str, np.ndarray]):
-    """The columns of a table, those of a CSV file as texts. One that is asked for has to be there."""
+    """The columns of a table, as texts if it is a CSV file. Asking for a missing column raises `FigureError`."""
 
     def __init__(self, path: Path, columns: dict[str, np.ndarray]):
         super().__init__(columns)
@@ -148,26 +158,31 @@ class Columns(dict[str, np.ndarray]):
         damaged(self.path, f"it has no column {name!r}")
 
     def numbers(self, name: str) -> np.ndarray:
-        """A column of texts as numbers; empty cells are NaN."""
+        """A column of texts as numbers. Empty cells are NaN."""
         column = self[name]
         with reading(self.path):
             return np.where(column == "", "nan", column).astype(float)
 
     def of_length(self, rows: int) -> Columns:
-        """Itself, if it has so many rows."""
+        """The same columns, after a check that there are this many table rows."""
         require_length(self.path, len(next(iter(self.values()))), rows)
         return self
 
     def where(self, **values: object) -> Columns:
-        """The rows in which columns of texts have these values."""
+        """The table rows in which columns of texts have these values."""
         return self.rows(np.all([self[name] == str(value) for name, value in values.items()], axis=0))
 
     def rows(self, chosen: np.ndarray) -> Columns:
-        """Some of the rows."""
+        """The chosen table rows."""
         return Columns(self.path, {name: column[chosen] for name, column in self.items()})
 
 
 def read_columns(path: Path) -> Columns:
+    """The columns of a CSV file, as texts.
+
+    Raises:
+        FigureError: the file is missing or damaged.
+    """
     with reading(path):
         text = path.read_text(encoding="utf-8")
         header, *rows = csv.reader(io.StringIO(text, newline=""), strict=True)
@@ -182,19 +197,28 @@ def read_columns(path: Path) -> Columns:
 
 
 def read_json(path: Path) -> Any:
+    """The content of a JSON file.
+
+    Raises:
+        FigureError: the file is missing or damaged.
+    """
     with reading(path):
         return json.loads(path.read_text(encoding="utf-8"))
 
 
 def read_lines(path: Path) -> list[Any]:
-    """A file of JSON, line by line."""
+    """The content of a file of JSON lines.
+
+    Raises:
+        FigureError: the file is missing or damaged.
+    """
     with reading(path), path.open(encoding="utf-8") as file:
         return [json.loads(line) for line in file]
 
 
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """Write the file that it yields: in the end `path` is that file, or what it was before."""
+    """In this block write the yielded file. At its end the file becomes `path`. After an error `path` is as it was."""
     partial = path.with_name(path.name + ".partial")
     try:
         with named(path):
@@ -206,7 +230,7 @@ def whole(path: Path) -> Iterator[Path]:
 
 
 class Appender:
-    """Appends to a file, each piece whole or not at all: a full disk cuts nothing in two."""
+    """Appends pieces to a file, each whole or not at all, also on a full disk."""
 
     def __init__(self, path: Path, keep: bool = False):
         self.path, self.file = path, path.open("a+b" if keep else "wb", buffering=0)
@@ -229,7 +253,7 @@ class Appender:
 
 
 class RowWriter(Appender):
-    """Writes a CSV file, some rows at a time. The first row's keys are its header."""
+    """Writes a CSV file, some table rows at a time. The keys of the first one are the header."""
 
     header: list[str] | None = None
 
@@ -246,6 +270,6 @@ class RowWriter(Appender):
 
 
 def write_rows(path: Path, rows: Iterable[dict[str, Any]]) -> None:
-    """A whole CSV file."""
+    """Write a CSV file as a whole."""
     with whole(path) as partial, RowWriter(partial) as writer:
         writer.write(rows)

@@ -1,4 +1,4 @@
-"""Tables for people, on a console. No torch in this module."""
+"""Tables on a console. This module does not import torch."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rich.table import Table
 
 
 def table(texts: Sequence[str], numbers: Sequence[str] = (), title: str | None = None) -> Table:
-    """Columns of texts, then of numbers. Where a console is too narrow cells are wrapped: nothing is cut off."""
+    """A table with columns of texts, then of numbers. In a narrow console cells wrap, and nothing is cut off."""
     made = Table(
         title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1), pad_edge=False, collapse_padding=True
     )
@@ -23,7 +23,7 @@ def table(texts: Sequence[str], numbers: Sequence[str] = (), title: str | None =
 
 
 def print_rows(console: Console, title: str, first: str, rows: Mapping[str, Mapping[str, Any]]) -> None:
-    """A row for each name."""
+    """Print a table with one table row for each name."""
     shown = table([first], list(next(iter(rows.values()), {})), title)
     for name, row in rows.items():
         shown.add_row(name, *(f"{value:.3g}" if isinstance(value, float) else str(value) for value in row.values()))

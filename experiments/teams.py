@@ -1,4 +1,4 @@
-"""Teams drawn at random: who starts where, and wants to go where. No torch in this module."""
+"""Random teams: starts and goals of robots. This module does not import torch."""
 
 from __future__ import annotations
 
@@ -24,11 +24,12 @@ class TeamConfig(Strict):
     """What a team is drawn from.
 
     Attributes:
-        robots, obstacles: least and greatest number, both included.
-        place: `circle`: robots start on a circle and go to about the opposite point; `disc`: from anywhere to anywhere.
-            Of several, each team draws one.
-        radius: of the circle or disc; obstacles stand in its inner half [m].
-        separation: between starts and obstacles, and between goals and obstacles, at least [m].
+        robots: least and greatest number of robots, both included.
+        obstacles: least and greatest number of obstacles, both included.
+        place: `circle`: robots start on a circle and go to about the opposite point. `disc`: starts and goals are
+            anywhere in a disc. Each team draws one of those given.
+        radius: radius of the circle or disc [m]. Obstacles stand in its inner half.
+        separation: least distance between starts and obstacles, and between goals and obstacles [m].
     """
 
     robots: Annotated[tuple[Robots, ...], Field(min_length=2, max_length=2)]
@@ -45,7 +46,11 @@ class TeamConfig(Strict):
         return self
 
     def draw(self, random: np.random.Generator) -> dict[str, list[dict[str, Any]]]:
-        """`robots` and `obstacles` of a scene. Raises `ConfigError` if there is no room for them."""
+        """The `robots` and `obstacles` of a scene.
+
+        Raises:
+            ConfigError: there is no room for them.
+        """
         robots, obstacles = (
             int(random.integers(least, greatest, endpoint=True)) for least, greatest in (self.robots, self.obstacles)
         )

@@ -1,20 +1,20 @@
-r"""A point-wise adaptive observer that stays in the set of possible parameters, with the gain as a part of its own.
+r"""A point-wise adaptive observer that stays in the set Theta of possible parameters. Its gain is exchangeable.
 
     theta+ = Proj_Theta( theta + Gamma G'(u - G theta - f) )         (G, f: u* = G theta + f at the observed active set)
 
-The projection is `torchfsid.layers.ProjectOnto`, so whatever the gain is made of can be trained through it. Gains:
+The projection is `torchfsid.layers.ProjectOnto`, so every gain can be trained through it. Gains:
 
     ConstantGain    Gamma = g/kp^2 I, g a parameter
     RlsGain         recursive least squares: Lambda+ = Lambda + G'G/R, Gamma = (Lambda+)^-1/R, Lambda_0 the prior's
                     information and R = delta^2/4 the variance, along an axis, of a disturbance even in a disc
-    NetworkGain     the same with Lambda+ = r Lambda + G'G/(s R), Gamma = (Lambda+)^-1/(s R); the distrust s > 0 of this
-                    sample and the memory 0 < r < 1 are a network's answer to how large Theta is, the case, the noise
+    NetworkGain     the same with Lambda+ = r Lambda + G'G/(s R), Gamma = (Lambda+)^-1/(s R); a network computes the
+                    distrust s > 0 of this sample and the memory 0 < r < 1 from the area of Theta, the case, the noise
 
-No gain moves the estimate while G = 0, or along the row of case B: there the set alone knows more. A gain that `pulls`
-may then step from where the projection has left the estimate towards the centroid c of Theta,
-theta+ + a (c - theta+), 0 < a < 1, which stays in Theta because it is convex.
+No gain moves the estimate while G = 0, or along the row of case B. There only the set gains information. A gain with a
+`pull` a then moves the projected estimate towards the centroid c of Theta: theta+ + a (c - theta+), 0 < a < 1. The
+result is in Theta because Theta is convex.
 
-Gamma G' = P G'(G P G' + R I)^-1 with P = Lambda^-1: the second is the Kalman gain, in its information form.
+Gamma G' = P G'(G P G' + R I)^-1 with P = Lambda^-1. The right-hand side is the Kalman gain, Gamma its information form.
 """
 
 from __future__ import annotations
@@ -35,11 +35,17 @@ UNTRAINED = (0.0, 7.0, -3.0)
 
 
 class Step(NamedTuple):
-    """What an instant says about B robots.
+    """What one sample says about B robots.
 
     Attributes:
-        theta_set: Theta(t). area: its area [m^2]. centroid: its centre of area [m]. case: index into `CASES`.
-        G, f: of the observed active set. u: measured [m/s]. noise: bound of its disturbance [m/s].
+        theta_set: the set Theta(t).
+        area: area of Theta(t) [m^2].
+        centroid: centroid of Theta(t) [m].
+        case: index into `CASES`.
+        G: matrix of u* = G theta + f at the observed active set [1/s].
+        f: vector of u* = G theta + f [m/s].
+        u: measured control [m/s].
+        noise: bound of its disturbance [m/s].
     """
 
     theta_set: Halfspaces
@@ -53,7 +59,13 @@ class Step(NamedTuple):
 
 
 class Update(NamedTuple):
-    """Gamma, the information matrix that is carried on, and the pull a (None: no pull)."""
+    """The answer of a gain to one sample.
+
+    Attributes:
+        Gamma: the gain matrix.
+        information: the information matrix Lambda+, passed on to the next sample.
+        pull: the pull a towards the centroid, or None for no pull.
+    """
 
     Gamma: Float[Tensor, "B 2 2"]
     information: Float[Tensor, "B 2 2"]
@@ -61,7 +73,7 @@ class Update(NamedTuple):
 
 
 class ConstantGain(nn.Module):
-    """Gamma = `share`/kp^2 I."""
+    """Gamma = `share`/kp^2 I, with a trainable `share`."""
 
     def __init__(self, share: float, kp: float):
         super().__init__()
@@ -74,7 +86,7 @@ class ConstantGain(nn.Module):
 
 
 class RlsGain(nn.Module):
-    """Recursive least squares with the noise as it is declared, and if given a constant `pull`."""
+    """Recursive least squares with the declared noise, and optionally a constant `pull`."""
 
     def __init__(self, pull: float | None = None):
         super().__init__()
@@ -88,7 +100,13 @@ class RlsGain(nn.Module):
 
 
 class Answer(NamedTuple):
-    """What the network says of B robots: see the module's head."""
+    """The output of the network for B robots (module docstring).
+
+    Attributes:
+        distrust: s, the factor on the variance of this sample.
+        memory: r, the factor on the earlier information.
+        pull: a, the step towards the centroid.
+    """
 
     distrust: Float[Tensor, "B"]
     memory: Float[Tensor, "B"]
@@ -96,10 +114,12 @@ class Answer(NamedTuple):
 
 
 class NetworkGain(nn.Module):
-    """Recursive least squares, with distrust and memory from a network; before training nearly `RlsGain`.
+    """Recursive least squares with distrust and memory from a network. Before training it is nearly `RlsGain`.
 
     Attributes:
-        prior_area: [m^2], the unit of areas. speed: [m/s], the unit of noise. pulls: towards the centroid, too.
+        prior_area: unit of areas [m^2].
+        speed: unit of noise [m/s].
+        pulls: the network also gives a pull towards the centroid.
     """
 
     def __init__(self, hidden: int, prior_area: float, speed: float, pulls: bool):
@@ -129,7 +149,8 @@ class AdaptiveObserver(nn.Module):
     """theta+ = Proj_Theta(theta + Gamma G'(u - G theta - f)), over a whole recording.
 
     Attributes:
-        gain: Gamma. project: onto Theta(t); None: not at all.
+        gain: the module that gives Gamma.
+        project: the projection onto Theta(t), or None for no projection.
     """
 
     def __init__(self, gain: nn.Module, projects: bool = True):
@@ -140,7 +161,13 @@ class AdaptiveObserver(nn.Module):
     def forward(
         self, steps: list[Step], theta: Float[Tensor, "B 2"], information: Float[Tensor, "B 2 2"]
     ) -> Float[Tensor, "T B 2"]:
-        """The estimates after each sample, from a first estimate and its information matrix (inverse covariance)."""
+        """The estimates after each sample.
+
+        Args:
+            steps: the samples.
+            theta: first estimate [m].
+            information: its information matrix, the inverse of the covariance.
+        """
         estimates = []
         for step in steps:
             Gamma, information, pull = self.gain(step, information)

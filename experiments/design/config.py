@@ -1,6 +1,6 @@
 """The files of `python -m experiments design`: `kind: probe_placement` and `kind: learned_observer`.
 
-Each file is complete; what is left out has the default written here. No torch in this module.
+Each file is complete. Keys that are left out have the defaults written here. This module does not import torch.
 """
 
 from __future__ import annotations
@@ -36,14 +36,17 @@ class BoxConfig(Strict):
 
 
 class DesignConfig(Strict):
-    """What both share: robots that go to goals, and how they avoid others.
+    """The common part: robots that go to goals and avoid bodies.
 
     Attributes:
-        gain: kp of the goal task [1/s].
-        avoidance: by a safety distance, neighbours' velocities ignored (the paper's row).
-        prior: what is known of a goal at first [m].
-        dt, duration: sampling time, and how long is observed [s].
-        seed: of everything random.
+        kind: the kind of file.
+        title: title of the figures.
+        gain: gain kp of the goal task [1/s].
+        avoidance: barrier by a safety distance that ignores neighbours' velocities (the paper's row).
+        prior: the prior set of a goal [m].
+        dt: sampling time [s].
+        duration: length of a run [s].
+        seed: seed of all random numbers.
     """
 
     kind: str
@@ -76,7 +79,13 @@ class DesignConfig(Strict):
 
 
 class GoalsConfig(Strict):
-    """Numbers of goals drawn: to search with, to choose among what was found, and to report."""
+    """Numbers of random goals.
+
+    Attributes:
+        train: goals to search with.
+        validation: goals to choose among finalists.
+        test: goals to report on.
+    """
 
     train: Several
     validation: Count
@@ -84,15 +93,16 @@ class GoalsConfig(Strict):
 
 
 class SearchConfig(Strict):
-    """A search of `starts` x `steps` placements, whatever the method.
+    """A search of `starts` x `steps` placements, for every method.
 
     Attributes:
-        starts: that the gradient follows at a time, and a generation of the cross-entropy method.
-        steps: of the gradient, and generations.
+        starts: placements that the gradient follows at a time, and size of a generation of the cross-entropy method.
+        steps: steps of the gradient method, and number of generations.
         spread: standard deviation of the starts about the predicted path [m].
-        learning_rate: of Adam [m].
-        objective: whose mean over goals Adam minimises. The others, and all selection, minimise the mean area.
-        elite: share of a generation that the next one is drawn from.
+        learning_rate: learning rate of Adam [m].
+        objective: quantity whose mean over goals Adam minimises. Other methods and all selections minimise the mean
+            area.
+        elite: share of a generation from which the next one is drawn.
         finalists: placements of each method that are compared on the validation goals.
     """
 
@@ -106,11 +116,13 @@ class SearchConfig(Strict):
 
 
 class GradientCheckConfig(Strict):
-    """Gradients of the mean over goals, against central differences.
+    """A check of the gradients of the mean over goals against central differences.
 
     Attributes:
         horizons: numbers of samples after which the area is taken.
-        placements, goals: over how many it is averaged. step: of the differences [m].
+        placements: number of placements over which the check is averaged.
+        goals: number of goals in the mean.
+        step: step of the differences [m].
     """
 
     horizons: Annotated[tuple[Count, ...], Field(min_length=1)]
@@ -123,12 +135,19 @@ class ProbePlacementConfig(DesignConfig):
     """Where to put a probing obstacle so that the set of possible goals shrinks most.
 
     Attributes:
-        start: of the robot [m]. obstacles: of the corridor [m].
-        scenes: corridors in which it is tried, each with obstacles moved by at most `jitter` [m] along each axis.
-        way_points: numbers of way-points, 1 (a probe that stands still) among them.
-        room: where way-points may be [m].
-        set, active_tolerance [m/s], velocity_noise [m/s]: of the observer; the last for `inverse_optimal`.
+        start: start of the robot [m].
+        obstacles: obstacles of the corridor [m].
+        scenes: number of corridors in which every method is tried.
+        jitter: largest displacement of a corridor's obstacles along each axis [m].
+        way_points: numbers of way-points. One of them is 1, a probe that stands still.
+        room: box of the allowed way-points [m].
+        set: the set that the observer uses.
+        active_tolerance: distance to its boundary below which a row counts as active [m/s].
+        velocity_noise: velocity bound of the observer, for `inverse_optimal` [m/s].
+        goals: numbers of goals.
+        search: the search.
         landscape: columns and rows of the grid of places.
+        gradient_check: the check of the gradients.
     """
 
     kind: Literal["probe_placement"]
@@ -160,7 +179,13 @@ class ProbePlacementConfig(DesignConfig):
 
 
 class TeamsConfig(Strict):
-    """Numbers of teams: to train on, to choose when to stop and to tune by hand, and to compare on."""
+    """Numbers of random teams.
+
+    Attributes:
+        train: teams to train on.
+        validation: teams to stop the training and to tune by hand.
+        test: teams to compare on.
+    """
 
     train: Count
     validation: Count
@@ -171,8 +196,9 @@ class TrainingConfig(Strict):
     """How a gain is trained.
 
     Attributes:
-        epochs: passes over the training teams. learning_rate: of Adam.
-        hidden: units of the network's layer.
+        epochs: passes over the training teams.
+        learning_rate: learning rate of Adam.
+        hidden: units of the network's hidden layer.
     """
 
     epochs: Count
@@ -181,14 +207,19 @@ class TrainingConfig(Strict):
 
 
 class LearnedObserverConfig(DesignConfig):
-    """A point-wise adaptive observer whose gain is trained, compared with others on teams it has not seen.
+    """A point-wise adaptive observer with a trained gain, compared with others on new teams.
 
     Attributes:
-        team: what teams are drawn from. teams: how many.
-        noise: bounds of the disturbance of the executed velocities [m/s], in training. unseen_noise: in the comparison.
-        gains: constant gains Gamma kp^2 from which the hand-tuned one is taken. pulls: likewise constant pulls.
-        times: at which errors are reported [s].
-        active_tolerance: distance to its boundary below which a row counts as active, beyond the noise [m/s].
+        team: what teams are drawn from.
+        teams: numbers of teams.
+        noise: bounds of the disturbance of the executed velocities in training [m/s].
+        unseen_noise: bounds of the disturbance in the comparison [m/s].
+        gains: constant gains Gamma kp^2 from which the hand-tuned one is chosen.
+        pulls: constant pulls from which the hand-tuned one is chosen.
+        training: how the gains are trained.
+        times: times at which errors are reported [s].
+        active_tolerance: distance to its boundary, beyond the noise, below which a row counts as active [m/s].
+        ukf: the filter to compare with.
     """
 
     kind: Literal["learned_observer"]

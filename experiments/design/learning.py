@@ -1,8 +1,8 @@
-"""Train gains through the projection, and compare them with other observers on teams and noise they have not seen.
+"""Train gains through the projection, and compare them with other observers on new teams and noise.
 
-runs.csv has mean errors by observer, noise and team, over time and at `times`; answers.csv what the trained network
-with pull answers, by noise, case and area; summary.json differences to plain recursive least squares with standard
-errors over teams. All lengths are in metres.
+runs.csv has mean errors by observer, noise and team, over time and at `times`. answers.csv has the outputs of the
+trained network with pull, by noise, case and area. summary.json has the differences from plain recursive least squares
+with standard errors over teams. All lengths are in metres.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from torchfsid.identification.kkt import CASES
 
 
 def learn(config: LearnedObserverConfig, out: Path, track: Track) -> dict[str, Any]:
-    """Simulate, train, compare; returns the summary. What an interruption finds done is in the folder."""
+    """Simulate, train, compare, and return the summary. After an interruption the folder has what was finished."""
     levels = len(config.noise)
     train_seed, validation_seed, test_seed, start_seed = np.random.SeedSequence(config.seed).spawn(4)
     seeds = [*train_seed.spawn(levels), *validation_seed.spawn(levels)]
@@ -82,7 +82,11 @@ def _compare(
     out: Path,
     track: Track,
 ) -> tuple[dict[str, float], list[dict[str, Any]]]:
-    """On teams and noise that no observer has seen; returns how often the sets held the truth, and runs.csv."""
+    """Compare on teams and noise that no observer has seen.
+
+    Returns:
+        How often the sets held the truth, and the rows of runs.csv.
+    """
     jobs = list(zip(config.unseen_noise, seed.spawn(len(config.unseen_noise)), strict=True))
     contains, rows = {}, []
     with RowWriter(out / "runs.csv") as runs, RowWriter(out / "curves.csv") as curves:
@@ -109,8 +113,11 @@ def train(
     config: LearnedObserverConfig,
     track: Track,
 ) -> list[dict[str, Any]]:
-    """Minimise the mean error over robots and time by Adam, and keep the epoch that is best on the validation teams.
-    Returns a row per epoch; epoch 0 is untrained."""
+    """Minimise the mean error over robots and time by Adam. Keep the epoch that is best on the validation teams.
+
+    Returns:
+        One table row per epoch. Epoch 0 is untrained.
+    """
     optimiser = torch.optim.Adam(observer.parameters(), lr=config.training.learning_rate)
     best, lowest, rows = copy.deepcopy(observer.state_dict()), float("inf"), []
     for epoch in track(range(config.training.epochs + 1), f"Training: {name}", config.training.epochs + 1):
@@ -152,7 +159,7 @@ def _rows(name: str, noise: float, error: Float[Tensor, "T B"], config: LearnedO
 
 
 def _answers(network: NetworkGain, config: LearnedObserverConfig) -> list[dict[str, Any]]:
-    """Distrust, memory and pull, from the prior's area down to where noise leaves Theta."""
+    """Distrust, memory and pull, from the area of the prior down to the area at which noise leaves Theta."""
     areas = network.prior_area * torch.logspace(-6, 0, 25, dtype=torch.float64)
     rows = []
     for noise in config.noise:
@@ -166,7 +173,7 @@ def _answers(network: NetworkGain, config: LearnedObserverConfig) -> list[dict[s
 
 
 def summarise(runs: list[dict[str, Any]], config: LearnedObserverConfig) -> dict[str, Any]:
-    """By noise and observer: mean errors, and the paired difference to `RLS` with its standard error over teams."""
+    """Mean errors by noise and observer, and the paired difference from `RLS` with its standard error over teams."""
     table: dict[str, Any] = {}
     keys = [key for key in runs[0] if key not in ("observer", "noise", "team")]
     for noise in config.unseen_noise:

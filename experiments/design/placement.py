@@ -1,7 +1,7 @@
-"""Place probes in many corridors by every method, and write down what came of it.
+"""Place probes in many corridors by every method, and record the results.
 
-runs.csv has the mean area over the held-out goals, the number of simulations (a placement with a goal) and the seconds;
-landscape.csv the mean area over the validation goals for a still probe on a grid of places.
+runs.csv has the mean area over the test goals, the number of simulations (one placement with one goal) and the seconds.
+landscape.csv has the mean area over the validation goals for a still probe on a grid of places.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ SHOWN = ("random", "adam")
 
 
 def place(config: ProbePlacementConfig, out: Path, track: Track) -> dict[str, Any]:
-    """Search and compare; returns the summary. What an interruption finds done is in the folder."""
+    """Search, compare, and return the summary. After an interruption the folder has what was finished."""
     checking, *seeds, drawing = np.random.SeedSequence(config.seed).spawn(2 + config.scenes)
     corridors = [_Corridor(config, seed) for seed in seeds]
     rows: list[dict[str, Any]] = []
@@ -59,12 +59,12 @@ def place(config: ProbePlacementConfig, out: Path, track: Track) -> dict[str, An
 
 
 def _methods(way_points: int) -> list[str]:
-    """A grid of way-points would need the power 2 K of the places along an axis."""
+    """The methods for K way-points. A grid is for K = 1 only: its size grows with the power 2 K."""
     return [*(["grid"] if way_points == 1 else []), *METHODS]
 
 
 class _Corridor:
-    """One corridor, its goals, and what was chosen for it."""
+    """One corridor, its goals, and the placements chosen for it."""
 
     def __init__(self, config: ProbePlacementConfig, seed: np.random.SeedSequence):
         moving, drawing, self._searching = seed.spawn(3)
@@ -77,9 +77,9 @@ class _Corridor:
         self.descent: list[dict[str, Any]] = []
 
     def compare(self, K: int, method: str) -> list[dict[str, Any]]:
-        """What a method comes to; `random` answers for no probe and for a single random placement too."""
+        """The table rows of a method. `random` also gives those of no probe and of a single random placement."""
         started = time.perf_counter()
-        # Every method meets the same randomness: the same starts, the same random places.
+        # Every method has the same random numbers: the same starts, the same random places.
         seed = np.random.SeedSequence(self._searching.entropy, spawn_key=(*self._searching.spawn_key, K))
         search = Search.of(self.probing, self.train, K, seed)
         found = self._on_grid(search) if method == "grid" else METHODS[method](search)
@@ -109,7 +109,7 @@ class _Corridor:
         }
 
     def _on_grid(self, search: Search) -> Evaluated:
-        """As many places as the others try, on a grid."""
+        """Evaluate as many places as the other methods, on a grid."""
         found, settings = Evaluated(), self.config.search
         lower, upper = self.probing.room
         width, height = (upper - lower).tolist()
@@ -120,7 +120,7 @@ class _Corridor:
         return found
 
     def landscape(self, track: Track) -> list[dict[str, Any]]:
-        """Places that are not allowed have no area."""
+        """Mean areas of a still probe on the grid. Places that are not allowed have no area."""
         places = _grid(self.probing, *self.config.landscape)
         allowed = (places - self.probing.start).norm(dim=-1) >= self.config.safety_distance
         means = torch.full((len(places),), torch.nan, dtype=torch.float64)
@@ -138,7 +138,7 @@ class _Corridor:
         return {"obstacles": self.probing.obstacles.tolist(), "chosen": chosen}
 
     def replay(self) -> dict[str, Any]:
-        """For the goal whose area with the last, most movable probe of Adam is the median one."""
+        """The runs with one goal: the one whose area is the median with Adam's probe of the most way-points."""
         K = max(self.chosen)
         with torch.no_grad():
             areas = self.probing.left(self.chosen[K]["adam"], self.test).area[0]
@@ -172,7 +172,7 @@ class _Corridor:
 
 
 def _grid(probing: Probing, columns: int, rows: int) -> Tensor:
-    """Middles of the cells of a grid over the room, row by row."""
+    """Centres of the cells of a grid over the room, row by row."""
     lower, upper = probing.room
     x, y = ((torch.arange(count, dtype=torch.float64) + 0.5) / count for count in (columns, rows))
     return lower + (upper - lower) * torch.cartesian_prod(y, x).flip(-1)
@@ -189,7 +189,7 @@ def _descent(found: Evaluated) -> list[dict[str, Any]]:
 
 
 def summarise(runs: list[dict[str, Any]], checks: list[dict[str, Any]]) -> dict[str, Any]:
-    """Means over corridors; every method against one random placement and the best of equally many."""
+    """Means over corridors, and every method against one random placement and the best of equally many."""
     table: dict[str, Any] = {}
     for K in dict.fromkeys(row["way_points"] for row in runs):
         of_K = [row for row in runs if row["way_points"] == K]

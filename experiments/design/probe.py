@@ -1,33 +1,33 @@
-r"""A probing obstacle near a robot, and what is left of the set of possible goals because of it.
+r"""A probing obstacle near a robot, and how it shrinks the set of possible goals.
 
-The robot avoids the probe like any other body, so the probe changes which rows are active, and with them what the
-motion says about the goal (the paper's first future work). A placement is K way-points q_1 .. q_K [m]: the probe stands
-still at q_1 (K = 1) or moves along the way-points at equal times from the first sample to the last.
+The robot avoids the probe like any other body. So the probe changes which rows are active, and with them what the
+motion says about the goal (the paper's first future work). A placement is K way-points q_1 .. q_K [m]. The probe stands
+still at q_1 (K = 1), or moves along the way-points at equal times from the first sample to the last.
 
-What is minimised is the mean over goals theta, drawn from the current set Theta_0, of A or of log A, where
-A(theta, q) is the area of Theta(T) that the observer ends with if theta is the true goal.
+The objective is the mean of A or of log A over goals theta drawn from the current set Theta_0. A(theta, q) is the area
+of the observer's final set Theta(T) if theta is the true goal.
 
 The gradient of a mean over goals is not the mean of the gradients. As a function of q each goal's A is smooth except
-where the history of active sets switches; there it jumps, and automatic differentiation does not see jumps. Let the
+where the history of active sets switches. There it jumps, and automatic differentiation does not see jumps. Let the
 histories be i = 1, 2, ... . If Theta(T) is the same set for all goals of a history, namely the set of these goals, the
 probability of history i is P_i = A_i/A_0. For phi_i = phi(A_i),
 
     grad sum_i P_i phi_i = sum_i P_i grad phi_i + sum_i phi_i grad P_i = mean(grad phi) + mean(phi grad log A),
 
-since grad P_i = P_i grad log A_i; and as sum_i grad P_i = 0, any constant may be taken off phi. The second term is what
-a change of the probabilities contributes. Automatic differentiation of
+since grad P_i = P_i grad log A_i. As sum_i grad P_i = 0, any constant may be subtracted from phi. The second term is
+the contribution of the changing probabilities. Automatic differentiation of
 
     L = mean(phi) + mean((phi - mean phi).detach() log A)
 
-gives both. Without it mean(grad log A) = grad (sum_i A_i)/A_0 = 0: exactly nothing; and for phi = A, since
-A grad log A = grad A, exactly half of the gradient. The condition holds for critical regions at the first sample, and
-for as long as the motion does not depend on the goal (G = 0). Goals whose motion differs cut the set differently; then
-L is an approximation (docs/design.md measures it). A tolerance of the active set breaks the condition too: the goals
-within it of a switch are given an active set that is not theirs, and with it a small set that need not hold them.
+gives both. Without the second term mean(grad log A) = grad (sum_i A_i)/A_0 = 0: no gradient at all. For phi = A the
+first term alone is exactly half of the gradient, since A grad log A = grad A. The condition holds for critical regions
+at the first sample, and as long as the motion does not depend on the goal (G = 0). Goals with different motions cut the
+set differently. Then L is an approximation (docs/design.md measures it). A tolerance of the active set breaks the
+condition, too: goals within it of a switch get a wrong active set, and with it a small set that may not hold them.
 
-Nothing is learned (A = A_0, and no gradient) from a goal for which a QP has no solution, an intersection is empty, an
-alarm is raised, the probe comes closer to the robot than the safety distance, or Theta(T) has lost the goal: an
-optimiser would use them.
+A goal counts as not learned from (A = A_0, no gradient) if a QP has no solution, an intersection is empty, there is an
+alarm, the probe comes closer to the robot than the safety distance, or Theta(T) does not hold the goal. Otherwise an
+optimiser would exploit these failures.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ class Left(NamedTuple):
     """What is left of Theta.
 
     Attributes:
-        area: of Theta(T) [m^2]; that of Theta_0 where nothing is learned.
-        sound: something may be learned there: it counts.
+        area: area of Theta(T) [m^2]. Where nothing is learned it is the area of Theta_0.
+        sound: something may be learned from this placement and goal.
     """
 
     area: Float[Tensor, "P S"]
@@ -70,10 +70,12 @@ class Left(NamedTuple):
 
 @dataclass(frozen=True)
 class Probing:
-    """A robot in a corridor, what is known of its goal, and the room for a probe.
+    """A robot in a corridor, the prior of its goal, and the room for a probe.
 
     Attributes:
-        obstacles: of the corridor [m]. start: of the robot [m].
+        config: the configuration.
+        obstacles: obstacles of the corridor [m].
+        start: start of the robot [m].
     """
 
     config: ProbePlacementConfig
@@ -82,7 +84,7 @@ class Probing:
 
     @classmethod
     def of(cls, config: ProbePlacementConfig, shift: Float[Tensor, "m 2"] | float = 0.0) -> Probing:
-        """The config's scene, its obstacles moved by `shift` [m]."""
+        """The scene of the configuration, with its obstacles moved by `shift` [m]."""
         obstacles = torch.tensor(config.obstacles, dtype=torch.float64) + shift
         return cls(config, obstacles, torch.tensor(config.start, dtype=torch.float64))
 
@@ -100,12 +102,15 @@ class Probing:
         return float((upper - lower).prod())
 
     def draw_goals(self, count: int, seed: int) -> Float[Tensor, "count 2"]:
-        """Goals of Theta_0, evenly spread (scrambled Sobol points)."""
+        """Goals evenly spread over Theta_0 (scrambled Sobol points) [m]."""
         lower, upper = self.prior
         return lower + (upper - lower) * torch.quasirandom.SobolEngine(2, True, seed).draw(count, dtype=torch.float64)
 
     def allowed(self, placements: Float[Tensor, "P K 2"]) -> Float[Tensor, "P K 2"]:
-        """The nearest placements in the room whose first way-point keeps the safety distance to the robot's start."""
+        """The nearest allowed placements [m].
+
+        All way-points are in the room, and the first keeps the safety distance from the robot's start.
+        """
         lower, upper = self.room
         placements = placements.clamp(lower, upper)
         away = placements[:, 0] - self.start
@@ -121,7 +126,7 @@ class Probing:
 
     @property
     def model(self) -> ObservationModel:
-        """What the observer is told of the robot."""
+        """The model of the robot that the observer assumes."""
         config, controller = self.config, self.controller
         noise = NoiseBound(config.velocity_noise) if config.set == "inverse_optimal" else None
         return ObservationModel(controller.task, controller.barriers, config.set, noise, config.active_tolerance)
@@ -129,8 +134,13 @@ class Probing:
     def loop(
         self, placements: Float[Tensor, "P K 2"] | None, goals: Float[Tensor, "S 2"], steps: int | None = None
     ) -> Iterator[Sample]:
-        """The robot in closed loop, for every placement with every goal, P x S items; without a placement, the goals
-        alone."""
+        """The robot in closed loop, with every placement and every goal: P x S items.
+
+        Args:
+            placements: way-points [m], or None for no probe (S items).
+            goals: goals [m].
+            steps: number of samples. Default: the whole run.
+        """
         config, S = self.config, len(goals)
         P, K = (1, 0) if placements is None else placements.shape[:2]
         standing = self.obstacles.expand(P * S, *self.obstacles.shape)
@@ -148,17 +158,22 @@ class Probing:
         return closed_loop(self.controller, theta, start, around, dt=config.dt, samples=steps or config.steps)
 
     def prior_of(self, items: int) -> FeasibleSet:
-        """Theta_0 of each item."""
+        """Theta_0, once for each item."""
         lower, upper = self.prior
         return FeasibleSet.from_box(lower.expand(items, 2), upper.expand(items, 2))
 
     def left(
         self, placements: Float[Tensor, "P K 2"] | None, goals: Float[Tensor, "S 2"], steps: int | None = None
     ) -> Left:
-        """What every placement comes to with every goal, after all samples or the first `steps`.
+        """What is left of Theta with every placement and every goal.
 
-        Theta does not change what a sample says, so all samples are read at once. Those that leave a facet in Theta(T)
-        are read once more, with gradients: the others do not change it.
+        The evidence of a sample does not depend on Theta, so all samples are read at once. Samples with a facet in
+        Theta(T) are read once more with gradients. The others do not change it.
+
+        Args:
+            placements: way-points [m], or None for no probe.
+            goals: goals [m].
+            steps: number of samples. Default: the whole run.
         """
         samples = list(self.loop(placements, goals, steps))
         T, B, model = len(samples), len(samples[0].measurement.x), self.model
@@ -174,7 +189,7 @@ class Probing:
             sound = sound & (apart >= self.config.safety_distance - TOUCHING).all(0)
         sound = sound & theta_set.contains(goals.repeat(B // len(goals), 1), TOUCHING)
         if torch.is_grad_enabled() and placements is not None and placements.requires_grad:
-            sample = theta_set.facets().source // found.omega.rows  # negative: of the prior
+            sample = theta_set.facets().source // found.omega.rows  # negative: a facet of the prior
             leaves_facet = torch.zeros(T + 1, B, dtype=torch.bool).scatter(0, sample.T % (T + 1), True)[:T]
             again = seen.select(leaves_facet.flatten())
             told = evidence(model, self.prior_of(len(again.x)), again).omega
@@ -184,7 +199,7 @@ class Probing:
 
 
 def along(placements: Float[Tensor, "P K 2"], fraction: float) -> Float[Tensor, "P 2"]:
-    """Where the probe is after this fraction of the time."""
+    """The position of the probe after this fraction of the run [m]."""
     K = placements.shape[1]
     i = min(int(fraction * (K - 1)), max(K - 2, 0))
     share = fraction * (K - 1) - i
@@ -192,8 +207,10 @@ def along(placements: Float[Tensor, "P K 2"], fraction: float) -> Float[Tensor, 
 
 
 def expectation(area: Float[Tensor, "P S"], objective: Objective) -> Float[Tensor, "P"]:
-    """The mean over goals of A or log A, with the gradient of that mean: L, see the module's head, has the value of
-    mean(phi) since the second term's own mean is taken off."""
+    """The mean over goals of A or log A, with the gradient of that mean.
+
+    This is L of the module docstring. Its value is mean(phi), because the second term has mean zero.
+    """
     log_area = area.log()
     phi = area if objective == "area" else log_area
     weight = (phi - phi.mean(-1, keepdim=True)).detach()
@@ -201,12 +218,15 @@ def expectation(area: Float[Tensor, "P S"], objective: Objective) -> Float[Tenso
 
 
 def slope(value: Float[Tensor, ""], placements: Float[Tensor, "P K 2"]) -> Float[Tensor, "P K 2"]:
-    """The gradient of a sum over placements: zero also where none of them changes anything."""
+    """The gradient of a sum over placements. It is zero if no placement changes anything."""
     return torch.autograd.grad(value, placements)[0] if value.requires_grad else torch.zeros_like(placements)
 
 
 def _by_item(rows: Halfspaces, used: Bool[Tensor, "T B"]) -> Halfspaces:
-    """What the `used` samples say of each item, one below the other. `rows` has these samples, in the order of time."""
+    """The rows of the `used` samples, stacked for each item.
+
+    `rows` has these samples only, in the order of time.
+    """
     B, item, slot = used.shape[1], used.nonzero()[:, 1], (used.long().cumsum(0) - 1)[used]
     most = int(used.sum(0).max())
     A, b = rows.A.new_zeros(B, most, *rows.A.shape[1:]), rows.b.new_ones(B, most, rows.rows)

@@ -1,8 +1,8 @@
-"""Random teams in closed loop under a disturbance, and what observers make of them: what gains are trained on.
+"""Random teams in closed loop under a disturbance, and other observers' estimates: the data to train gains on.
 
-The velocity executed is u* + w with w even in a disc of radius `noise`; it is measured exactly, and so are positions:
-every observer sees the same disturbance, the filter through positions, the set through velocities. Theta(t), G and f do
-not depend on the gain, so one run of the team serves any number of passes of the training.
+The executed velocity is u* + w, with w even in a disc of radius `noise`. Velocities and positions are measured exactly.
+So all observers see the same disturbance: the filter through positions, the set through velocities. Theta(t), G and f
+do not depend on the gain, so one run of a team serves all passes of the training.
 """
 
 from __future__ import annotations
@@ -29,15 +29,16 @@ from torchfsid.sets.feasible_set import FeasibleSet
 
 @dataclass(frozen=True)
 class Rollouts:
-    """What was seen of B robots, teams one after the other, and what other observers make of it.
+    """The samples of B robots, team after team, and other observers' estimates.
 
     Attributes:
-        steps: sample by sample, what an adaptive observer uses.
-        goals: the truth [m].
+        steps: the input of an adaptive observer, sample by sample.
+        goals: the true goals [m].
         noise: bound of the disturbance [m/s].
-        theta, information: centre and information matrix of the prior.
-        estimates: by observer, (T, B, 2) [m]: `centroid`, and where filters were run `ukf` and `hybrid`.
-        contains: the share of samples at which Theta(t) holds the truth.
+        theta: centre of the prior [m].
+        information: information matrix of the prior.
+        estimates: estimates (T, B, 2) by observer [m]: `centroid`, and with filters `ukf` and `hybrid`.
+        contains: share of samples at which Theta(t) holds the truth.
     """
 
     steps: list[Step]
@@ -52,7 +53,15 @@ class Rollouts:
 def roll_out(
     config: LearnedObserverConfig, noise: float, teams: int, seed: np.random.SeedSequence, filters: bool
 ) -> Rollouts:
-    """Draw and run teams, all in one batch. `filters`: run the UKF and the hybrid too, which takes longest."""
+    """Draw teams and run them in one batch.
+
+    Args:
+        config: the configuration.
+        noise: bound of the disturbance [m/s].
+        teams: number of teams.
+        seed: seed of the teams and of the disturbance.
+        filters: also run the UKF and the hybrid, which takes longest.
+    """
     random = np.random.default_rng(seed)
     scenes = [config.team.draw(random) for _ in range(teams)]
     starts, goals = (
@@ -123,7 +132,7 @@ def roll_out(
 
 
 def _hybrid(config: LearnedObserverConfig, sets: SetMembershipObserver, noise: float) -> HybridObserver:
-    """The filter is told how large the disturbance is: `noise`/2 along an axis, anew at every sample."""
+    """The hybrid observer. Its filter knows the disturbance: `noise`/2 along an axis, independent at every sample."""
     prior = sets.feasible_set.body.vertices
     ukf = ParameterUkf.from_prior(
         sets.task,

@@ -1,7 +1,7 @@
-r"""Where to put the probe: one gradient method, and what it has to beat at the same number of simulations.
+r"""Where to put the probe: a gradient method, and others at the same number of simulations.
 
 Every method evaluates `starts` x `steps` placements on the same training goals. Its `finalists`, the placements with
-the smallest mean areas, are compared on the validation goals; the best of them is its answer, to be judged on goals
+the smallest mean areas, are compared on the validation goals. The best of them is its answer. It is judged on goals
 that no method has seen.
 
     one_random    a place drawn from the room; nothing is compared
@@ -36,8 +36,13 @@ TURN = 1.0
 
 @dataclass
 class Evaluated:
-    """Placements in the order of their evaluation, and their mean areas over the training goals [m^2]. Batches on ways
-    down are the last; `starts` numbers where each of their placements comes from."""
+    """Placements in the order of their evaluation. Batches on descents come last.
+
+    Attributes:
+        placements: way-points of each batch [m].
+        means: mean areas over the training goals [m^2].
+        starts: for each placement of a descent, the number of the start that it comes from.
+    """
 
     placements: list[Float[Tensor, "P K 2"]] = field(default_factory=list)
     means: list[Float[Tensor, "P"]] = field(default_factory=list)
@@ -51,7 +56,15 @@ class Evaluated:
 
 @dataclass(frozen=True)
 class Search:
-    """What the methods share: the scene, the goals to search with, the predicted path, randomness."""
+    """The common part of the methods.
+
+    Attributes:
+        probing: the scene.
+        goals: the training goals [m].
+        path: the predicted path [m].
+        way_points: number of way-points.
+        random: source of random numbers.
+    """
 
     probing: Probing
     goals: Float[Tensor, "S 2"]
@@ -64,15 +77,18 @@ class Search:
         return cls(probing, goals, predicted_path(probing, goals), way_points, np.random.default_rng(seed))
 
     def anywhere(self, count: int) -> Float[Tensor, "P K 2"]:
-        """Way-points drawn evenly from the room."""
+        """Way-points drawn uniformly from the room [m]."""
         lower, upper = self.probing.room
         even = torch.from_numpy(self.random.uniform(size=(count, self.way_points, 2)))
         return self.probing.allowed(lower + (upper - lower) * even)
 
     def near_path(self, count: int) -> Float[Tensor, "P K 2"]:
-        """A probe that stands still is drawn near any point of the predicted path. A way-point is drawn on a ring, the
-        safety distance and a little more, around the point where the robot will be then, each some way around the
-        ring from the one before."""
+        """Placements near the predicted path [m].
+
+        A still probe is drawn near any point of the path. A way-point is drawn on a ring around the robot's position at
+        that time, with a radius a little above the safety distance. Each is turned some way around the ring from the
+        one before.
+        """
         config, T, K = self.probing.config, len(self.path), self.way_points
         spread = config.search.spread
         if K == 1:
@@ -94,7 +110,7 @@ class Search:
 
 
 def predicted_path(probing: Probing, goals: Float[Tensor, "S 2"]) -> Float[Tensor, "T 2"]:
-    """Where the robot goes without a probe, on average over its possible goals [m]."""
+    """The mean path of the robot over its possible goals, without a probe [m]."""
     with torch.no_grad():
         return torch.stack([sample.measurement.x.mean(0) for sample in probing.loop(None, goals)])
 
@@ -111,7 +127,7 @@ def drawn(draw: Callable[[Search, int], Tensor]) -> Callable[[Search], Evaluated
 
 
 def cem(search: Search) -> Evaluated:
-    """The cross-entropy method (R. Rubinstein, 1999), axis by axis, its first generation near the predicted path."""
+    """The cross-entropy method (R. Rubinstein, 1999), axis by axis. Its first generation is near the predicted path."""
     found, settings = Evaluated(), search.probing.config.search
     elite = max(2, round(settings.elite * settings.starts))
     placements = search.near_path(settings.starts)
@@ -125,10 +141,12 @@ def cem(search: Search) -> Evaluated:
 
 
 def adam(search: Search) -> Evaluated:
-    """Adam, all placements at a time; after each step the nearest allowed ones. From most starts there is no way down:
-    there the probe changes nothing, or comes too close. So a fifth of the simulations chooses starts, and the others
-    go in equal shares to the best `starts`/2, the best half of these, and the best half again (successive halving; K.
-    Jamieson, A. Talwalkar, 2016): the fewer they are, the more steps each has. The learning rate falls to zero."""
+    """Adam by successive halving (K. Jamieson, A. Talwalkar, 2016), projected onto the allowed placements.
+
+    From most starts there is no descent: the probe changes nothing or comes too close. So a fifth of the simulations
+    chooses starts. The others go in equal shares to the best `starts`/2, the best half of these, and the best half
+    again. The fewer starts are left, the more steps each has. The learning rate falls to zero.
+    """
     found, settings = Evaluated(), search.probing.config.search
     for _ in range(max(settings.steps // 5, 1)):
         placements = search.near_path(settings.starts)
@@ -155,7 +173,7 @@ def _descend(
     steps: int,
     rates: Sequence[float],
 ) -> tuple[Float[Tensor, "P K 2"], Float[Tensor, "P"]]:
-    """The best placement on the way from each, and its mean area; the learning rate goes from one to the other."""
+    """The best placement on the descent from each start, and its mean area. The learning rate changes over `rates`."""
     placements = best.clone().requires_grad_()
     optimiser = torch.optim.Adam([placements])
     for k in range(steps):
@@ -167,7 +185,7 @@ def _descend(
         lowest = torch.where(better, means, lowest)
         optimiser.zero_grad()
         expected = expectation(areas, search.probing.config.search.objective).sum()
-        if expected.requires_grad:  # it does not where no placement changes anything
+        if expected.requires_grad:  # false if no placement changes anything
             expected.backward()
             optimiser.step()
             with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Every figure of a results folder, from its files alone."""
+"""The figures of a results folder, drawn from its files alone."""
 
 from __future__ import annotations
 
@@ -16,10 +16,14 @@ from torchfsid.commands.results_folder import named
 
 
 def draw(folder: Path, config: Any) -> list[Path]:
-    """Draw what the kind of `config` has to show, each figure as PNG and PDF, each film as GIF.
+    """Draw all figures of the configuration's kind, each figure as PNG and PDF, each film as GIF.
+
+    Args:
+        folder: the results folder.
+        config: its configuration.
 
     Raises:
-        FigureError: a file that is needed is missing or damaged.
+        FigureError: a needed file is missing or damaged.
         OSError: a figure cannot be written.
     """
     require(folder, config.kind)
@@ -41,6 +45,6 @@ def _save(drawn: Figure | Film, folder: Path, name: str) -> list[Path]:
         # No date in the PDF: the same results give the same file.
         with named(path):
             drawn.savefig(path, metadata={"CreationDate": None} if path.suffix == ".pdf" else None)
-        # Once is enough: the layout is the slowest part of drawing.
+        # Computed once: the layout is the slowest part of drawing.
         drawn.set_layout_engine("none")
     return paths

@@ -1,6 +1,6 @@
-"""The run as a film: the map, the whole region to its own scale, and the lengths as they fall.
+"""A film of the run: the map, the regions to their own scale, and the lengths over time.
 
-The background is drawn once; a frame only adds what moves.
+The background is drawn once. A frame adds only what moves.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ Redraw = Callable[[int], Iterable[Artist]]
 
 
 def animate(results: Results, config: SceneConfig) -> Film:
+    """The film of a run."""
     film = Film(FRAME_MS, COLOURS)
     with mpl.rc_context({"font.size": 8, "axes.titlesize": 8.5, "axes.labelsize": 8}):
         figure = Figure(figsize=SIZE, dpi=DPI, layout="constrained")
@@ -62,7 +63,7 @@ def animate(results: Results, config: SceneConfig) -> Film:
 
 
 def _colours(config: SceneConfig) -> list[str]:
-    """A single robot's region has the colour of the other figures, a team's those of its robots."""
+    """The colours of the regions: one fixed colour for a single robot, the robots' colours for a team."""
     count = len(config.robots)
     return [SET_COLOURS[config.set]] if count == 1 else [TEAM[i % len(TEAM)] for i in range(count)]
 
@@ -105,7 +106,7 @@ def _map(axes: Axes, results: Results, config: SceneConfig) -> Redraw:
 
 
 def _regions(axes: Axes, results: Results, config: SceneConfig) -> Redraw:
-    """Every region about its goal, to the scale of the largest."""
+    """Every region about its goal, all to the scale of the largest."""
     regions = [add_region(axes, np.zeros((3, 2)), colour, filled=True) for colour in _colours(config)]
     scale = axes.text(0.99, 0.98, "", transform=axes.transAxes, ha="right", va="top")
     add_goal(axes, (0.0, 0.0), size=10)
@@ -131,7 +132,7 @@ def _regions(axes: Axes, results: Results, config: SceneConfig) -> Redraw:
 
 
 def _curves(axes: Axes, results: Results) -> Redraw:
-    """Lengths, over a team their geometric means."""
+    """Lengths over time. For a team, their geometric means."""
     measures = lengths(results)
     shown = [
         (f"{results.config.set} sqrt_area", "region √area", SET_COLOURS[results.config.set], 1.6, "-"),

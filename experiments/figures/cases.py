@@ -24,7 +24,7 @@ SHADOW = 20.0
 
 
 def draw_cases(folder: Path, config: CasesConfig) -> Iterator[tuple[str, Figure]]:
-    """A column per case: the rows over the control half-way through, the final sets over the goal, and lengths."""
+    """One column per case: the rows over the control at half time, the final sets over the goal, lengths over time."""
     results, count = Results(folder, config), len(config.cases)
     figure = Figure(figsize=(1.62 * count + 0.6, 6.3), layout="constrained")
     axes = figure.subplots(3, count, height_ratios=(1, 1, 0.9))
@@ -66,7 +66,7 @@ def draw_cases(folder: Path, config: CasesConfig) -> Iterator[tuple[str, Figure]
 
 
 def _measured(results: Results) -> list[dict[str, Any]]:
-    """What summary.json says of each case, as far as it is shown."""
+    """The entries of summary.json for each case that are shown."""
     path = results.folder / "summary.json"
     with reading(path):
         of_cases = read_json(path)["cases"]
@@ -85,7 +85,7 @@ def _set_verdict(axes: Axes, measured: dict[str, Any]) -> None:
 
 
 def _draw_rows(axes: Axes, region: Region, reach: float) -> None:
-    """The plane of controls: rows with their forbidden sides, where the goal pulls, and what the robot does."""
+    """The plane of controls: the rows with their forbidden sides, the nominal control and the control."""
     on = np.abs(region.rows[:, :2] @ region.u - region.rows[:, 2]) < 1e-6
     for (a_x, a_y, b), active in zip(region.rows, on, strict=True):
         normal, along, far = np.array([a_x, a_y]), np.array([-a_y, a_x]), SHADOW * reach
@@ -102,7 +102,7 @@ def _draw_rows(axes: Axes, region: Region, reach: float) -> None:
 
 
 def _draw_sets(axes: Axes, results: Results, i: int) -> None:
-    """The plane of goals: what is left of the prior at the end."""
+    """The plane of goals: the final sets within the prior."""
     (left, bottom), (right, top) = np.array(results.config.prior.lower), np.array(results.config.prior.upper)
     axes.add_patch(Rectangle((left, bottom), right - left, top - bottom, fill=False, ec="0.6", lw=0.8))
     for kind, filled in (("critical_region", True), ("inverse_optimal", False)):

@@ -1,6 +1,6 @@
-"""What the figures of scenes share: the map with its bodies, regions, and the frame around what matters.
+"""Common parts of the figures of scenes: the map with its bodies, regions, and the frame of a map.
 
-A body is drawn as a disc of radius Ds/2, the robot too: two discs that touch are at the safety distance.
+A body, the robot included, is a disc of radius Ds/2. Two discs that touch are at the safety distance.
 """
 
 from __future__ import annotations
@@ -24,18 +24,19 @@ NO_RADIUS = 0.1
 
 
 def disc_radius(config: SceneConfig) -> float:
+    """The radius in which bodies are drawn [m]."""
     return NO_RADIUS if config.safety_distance is None else config.safety_distance / 2
 
 
 def map_frame(results: Results, config: SceneConfig, aspect: float) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corner [m] of a box of this width / height around all bodies and goals."""
+    """Lower and upper corner [m] of a box around all bodies and goals. `aspect` is its width / height."""
     radius = disc_radius(config)
     points = np.concatenate([*results.paths.values(), results.goals])
     return padded(points.min(0) - 1.3 * radius, points.max(0) + 1.3 * radius, aspect, 1.06)
 
 
 def padded(lower: np.ndarray, upper: np.ndarray, aspect: float, margin: float) -> tuple[np.ndarray, np.ndarray]:
-    """The box, `margin` times as large and then widened or heightened to width / height = aspect."""
+    """The box [m], `margin` times as large, then extended to width / height = aspect."""
     centre, half = (lower + upper) / 2, np.maximum(margin * (upper - lower) / 2, SMALLEST)
     half = np.array([max(half[0], half[1] * aspect), max(half[1], half[0] / aspect)])
     return centre - half, centre + half
@@ -47,7 +48,7 @@ def frame(axes: Axes, box: tuple[np.ndarray, np.ndarray]) -> None:
 
 
 def add_obstacles(axes: Axes, config: SceneConfig) -> list[Circle]:
-    """Inactive obstacles, in the order of the config, each with its name."""
+    """Draw inactive obstacles with their names, in the order of the configuration."""
     discs = []
     for obstacle in config.obstacles:
         x, y = obstacle.position
@@ -59,7 +60,7 @@ def add_obstacles(axes: Axes, config: SceneConfig) -> list[Circle]:
 
 
 def darken(axes: Axes, discs: Sequence[Circle], config: SceneConfig, active: Sequence[str]) -> None:
-    """Show which obstacles are active."""
+    """Mark the active obstacles."""
     for disc, text, obstacle in zip(discs, axes.texts, config.obstacles, strict=False):
         on = obstacle.name in active
         disc.set(facecolor=ACTIVE if on else INACTIVE, edgecolor="0.1" if on else "0.55", zorder=2.5 if on else 2)

@@ -17,8 +17,9 @@ class Film:
     """Frames of one size.
 
     Attributes:
-        frame_ms: how long each is shown; the last one is shown longer.
-        colours: of the palette.
+        frame_ms: how long a frame is shown [ms]. The last one is shown longer.
+        colours: number of colours of the palette.
+        frames: the frames so far.
     """
 
     frame_ms: int
@@ -26,10 +27,11 @@ class Film:
     frames: list[Image.Image] = field(default_factory=list)
 
     def add(self, canvas: FigureCanvasAgg) -> None:
-        """What the canvas shows is the next frame."""
+        """Add what the canvas shows as the next frame."""
         self.frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
 
     def save(self, path: Path) -> None:
+        """Write the GIF."""
         width, height = self.frames[0].size
         shown = [self.frames[0], self.frames[len(self.frames) // 2], self.frames[-1]]
         strip = Image.new("RGB", (width, height * len(shown)))
@@ -42,5 +44,5 @@ class Film:
 
 
 def spread(samples: int, frames: int) -> list[int]:
-    """At most so many samples, evenly spread, the first and the last among them."""
+    """At most `frames` sample indices, evenly spaced, the first and the last sample included."""
     return np.unique(np.linspace(0, samples - 1, frames).round().astype(int)).tolist()

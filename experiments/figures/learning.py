@@ -1,4 +1,4 @@
-"""Learned gains in one figure: errors over time at each level of noise, the training, what the network answers."""
+"""One figure of learned gains: errors over time at each level of noise, the training, the outputs of the network."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ CASES = {"A": "0.8", "B": INVERSE_OPTIMAL, "D": ROBOT}
 
 
 def draw_learning(folder: Path, config: LearnedObserverConfig) -> Iterator[tuple[str, Figure]]:
+    """The figure, with its name."""
     levels = config.unseen_noise
     figure = Figure(figsize=(3.4 * max(len(levels), 3), 5.2), layout="constrained")
     grid = figure.add_gridspec(2, 6, height_ratios=(1.25, 1))

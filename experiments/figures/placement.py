@@ -1,4 +1,4 @@
-"""The figures of a placed probe: the search, what the probe changes, and a film of that."""
+"""The figures of a placed probe: the search, the runs with and without probes, and a film of these."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from experiments.results import damaged, read_json, reading
 
 
 def draw_placement(folder: Path, config: ProbePlacementConfig) -> Iterator[tuple[str, Figure | Film]]:
+    """The figures and the film, with their names."""
     replay = _replay(folder / "replay.json")
     yield "figure", draw_search(folder, config)
     yield "comparison", draw_before_after(replay, config)
@@ -24,7 +25,7 @@ def draw_placement(folder: Path, config: ProbePlacementConfig) -> Iterator[tuple
 
 
 def _replay(path: Path) -> dict[str, Any]:
-    """What happens to one goal, without a probe and with several: checked here, so that it can be drawn."""
+    """The runs with one goal, without a probe and with several. The content is checked, so that it can be drawn."""
     with reading(path):
         replay = read_json(path)
         _points(replay["goal"], *replay["obstacles"])
@@ -41,5 +42,10 @@ def _replay(path: Path) -> dict[str, Any]:
 
 
 def _points(*points: Any) -> None:
-    """Raises `ValueError` or `TypeError` for what is not a pair of numbers."""
+    """Check that these are pairs of numbers.
+
+    Raises:
+        ValueError: one is not a pair.
+        TypeError: one does not hold numbers.
+    """
     np.array(points, dtype=float).reshape(len(points), 2)

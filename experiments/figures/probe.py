@@ -1,4 +1,4 @@
-"""Probe placement in two figures: the search (landscape, methods, gradients, switches), and what a probe changes."""
+"""Two figures of probe placement: the search (landscape, methods, gradients, switches), and runs with a probe."""
 
 from __future__ import annotations
 
@@ -39,6 +39,7 @@ MARKERS = {"random": "s", "grid": "D", "cem": "P", "adam": "*"}
 
 
 def draw_search(folder: Path, config: ProbePlacementConfig) -> Figure:
+    """The figure of the search."""
     figure = Figure(figsize=(11.5, 6.0), layout="constrained")
     grid = figure.add_gridspec(2, 3, height_ratios=(1.2, 1), width_ratios=(1, 1, 1.7))
     _landscape(figure.add_subplot(grid[0, :2]), folder, config)
@@ -90,14 +91,16 @@ def _landscape(axes: Axes, folder: Path, config: ProbePlacementConfig) -> None:
 
 
 def _ways(table: Columns) -> list[np.ndarray]:
-    """The places on the way down from each start. A start that goes on from one stage to the next does so from the best
-    of its places."""
+    """The places on the descent from each start.
+
+    From one stage to the next a descent goes on from the best of its places.
+    """
     places = np.stack([table.numbers("x"), table.numbers("y")], axis=-1)
     return [places[table["start"] == start] for start in dict.fromkeys(table["start"])]
 
 
 def _first_corridor(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Its obstacles, and where each method would let a still probe stand."""
+    """The obstacles of the first corridor, and each method's place of a still probe [m]."""
     with reading(path):
         first = read_json(path)[0]
         chosen = {name: np.array(at[0], dtype=float).reshape(2) for name, at in first["chosen"]["1"].items()}
@@ -172,6 +175,7 @@ def _switches(axes: Axes, folder: Path) -> None:
 
 
 def draw_before_after(replay: dict[str, Any], config: ProbePlacementConfig) -> Figure:
+    """The figure of one goal without a probe and with several."""
     runs: list[dict[str, Any]] = replay["runs"]
     figure = Figure(figsize=(11.5, 4.6), layout="constrained")
     grid = figure.subplots(2, 1 + (len(runs) - 1 + 1) // 2, squeeze=False)
@@ -200,11 +204,12 @@ def draw_before_after(replay: dict[str, Any], config: ProbePlacementConfig) -> F
 
 
 def _by_way_points(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A row of maps for each method, its columns the numbers of way-points."""
+    """A row of maps for each method. Its columns are the numbers of way-points."""
     return sorted(runs, key=lambda run: (run["method"] != "random", run["way_points"]))
 
 
 def name_of(run: dict[str, Any]) -> str:
+    """The name of a run in figures."""
     if run["way_points"] == 0:
         return "no probe"
     what = {"random": "best random", "adam": "Adam's"}[run["method"]]
@@ -212,7 +217,7 @@ def name_of(run: dict[str, Any]) -> str:
 
 
 def draw_map(axes: Axes, replay: dict[str, Any], run: dict[str, Any], config: ProbePlacementConfig, k: int) -> None:
-    """The corridor at sample k: Theta, the robot and where it came from, the probe and its way."""
+    """The corridor at sample k: Theta, the robot and its path, the probe and its path."""
     sample, radius = run["samples"][k], config.safety_distance / 2
     lower, upper = np.array(config.prior.lower), np.array(config.prior.upper)
     width, height = upper - lower

@@ -1,4 +1,4 @@
-"""Before and after as a film: the same goal without a probe and with the path that was found."""
+"""A film of the same goal without a probe and with the path that was found."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SIZE, DPI = (8.0, 2.6), 90
 
 
 def animate(replay: dict[str, Any], config: ProbePlacementConfig) -> Film:
-    """One frame per sample, at most `FRAMES`."""
+    """The film: one frame per sample, at most `FRAMES`."""
     shown, film = [replay["runs"][0], replay["runs"][-1]], Film(FRAME_MS, COLOURS)
     with mpl.rc_context({"font.size": 8, "axes.titlesize": 8.5}):
         for k in spread(len(shown[0]["samples"]), FRAMES):

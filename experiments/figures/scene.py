@@ -1,4 +1,4 @@
-"""The figures of a scene: the paper's, of one robot or of a team, and a film of the run."""
+"""The figures of a scene with one robot or a team, as in the paper, and a film of the run."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from experiments.runs.saved import Results
 
 
 def draw_scene(folder: Path, config: SceneConfig) -> Iterator[tuple[str, Figure | Film]]:
+    """The figures and the film, with their names."""
     results = Results(folder, config)
     if len(config.robots) == 1:
         yield "figure", draw_single(results, config)

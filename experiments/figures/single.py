@@ -1,4 +1,4 @@
-"""The paper's figure of a scene with one robot: snapshots, under each the whole region, and all errors over time."""
+"""The paper's figure of a scene with one robot: snapshots, below each the region, and all errors over time."""
 
 from __future__ import annotations
 
@@ -43,6 +43,7 @@ ASPECT = 1.25
 
 
 def draw_single(results: Results, config: SceneConfig) -> Figure:
+    """The figure."""
     samples = [results.at(t) for t in config.snapshots]
     count = len(samples)
     figure = Figure(figsize=(2.45 * count + 3.6, 4.9), layout="constrained")
@@ -82,7 +83,7 @@ def _draw_map(axes: Axes, results: Results, config: SceneConfig, k: int, box: tu
 
 
 def _draw_region(axes: Axes, results: Results, k: int, box: tuple[np.ndarray, np.ndarray]) -> None:
-    """The whole region about the goal, to its own scale; a dashed frame is the map's."""
+    """The region about the goal, to its own scale. A dashed frame is the frame of the map."""
     region, goal = results.regions[k][0], results.goals[0]
     for kind, filled in (("critical_region", True), ("inverse_optimal", False)):
         drawn = add_region(axes, region.vertices[kind] - goal, SET_COLOURS[kind], filled=filled)
@@ -104,7 +105,7 @@ def _draw_region(axes: Axes, results: Results, k: int, box: tuple[np.ndarray, np
 
 
 def _add_estimates(axes: Axes, results: Results, k: int, origin: np.ndarray) -> None:
-    """The filter's path and where it is now, and the hybrid estimate, clipped to the frame."""
+    """The filter's path and present estimate, and the hybrid estimate, clipped to the frame."""
     ukf = results.numbers("ukf_0", "ukf_1")[: k + 1, 0] - origin
     hybrid = results.numbers("hybrid_0", "hybrid_1")[k, 0] - origin
     axes.plot(*ukf.T, color=UKF, lw=1.1, zorder=6)
@@ -113,6 +114,7 @@ def _add_estimates(axes: Axes, results: Results, k: int, origin: np.ndarray) -> 
 
 
 def draw_errors(axes: Axes, results: Results, samples: list[int]) -> None:
+    """Errors and sizes over time, with the snapshots marked."""
     measures = lengths(results)
     for curve in CURVES:
         values = measures[curve.measure][:, 0]
@@ -136,7 +138,7 @@ def draw_errors(axes: Axes, results: Results, samples: list[int]) -> None:
 
 
 def draw_strip(axes: Axes, results: Results) -> None:
-    """How many rows are active, over time."""
+    """The number of active rows over time."""
     active = results.n_active()[:, 0]
     axes.fill_between(results.t, active, step="post", color=ACTIVE, alpha=0.75, lw=0)
     top = max(2, int(active.max()))

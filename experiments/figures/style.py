@@ -1,4 +1,4 @@
-"""How the figures look: Okabe and Ito's colours, which the colour-blind can tell apart; one kind of line per thing."""
+"""The style of the figures: Okabe and Ito's colours for the colour-blind, and one line style per quantity."""
 
 from __future__ import annotations
 
@@ -46,7 +46,13 @@ SET_NAMES = {"critical_region": "paper's region Θ", "inverse_optimal": "inverse
 
 @dataclass(frozen=True)
 class Curve:
-    """A line in the comparison of errors: its name in `experiments.lengths.lengths`, its label, its looks."""
+    """A line in the comparison of errors.
+
+    Attributes:
+        measure: its name in `experiments.runs.lengths.lengths`.
+        label: its label in the legend.
+        looks: its style, as options of matplotlib.
+    """
 
     measure: str
     label: str
@@ -67,6 +73,6 @@ UNITS = ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm"), (1e-9, "nm"))
 
 
 def length(metres: float) -> str:
-    """A length as people write it: 14 m, 0.11 m, 3.2 mm, 1.1 µm."""
+    """A length [m] as text with a suitable unit: 14 m, 0.11 m, 3.2 mm, 1.1 µm."""
     unit, name = next((unit for unit in UNITS if metres >= 0.1 * unit[0]), UNITS[-1])
     return f"{metres / unit:.2g} {name}"

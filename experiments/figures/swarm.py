@@ -1,4 +1,4 @@
-"""A swarm: where the robots are at some times, coloured by how large their sets still are; and how the sets shrink."""
+"""A swarm: the robots at some times, coloured by the size of their sets, and the sizes over time."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ SMALLEST = 1e-6
 
 
 def draw_swarm(folder: Path, config: SwarmConfig) -> Iterator[tuple[str, Figure]]:
+    """The figure, with its name."""
     sizes = read_columns(folder / "sizes.csv").of_length(config.steps + 1)
     snapshots = {round(t / config.dt) for t in config.snapshots}
     robots = read_columns(folder / "snapshots.csv").of_length(config.robots * len(snapshots))

@@ -1,5 +1,7 @@
-"""A sweep: a column per entry of the first line of its grid. Does each set hold the truth; how large are sets and
-errors over time; in which of the paper's cases are the robots."""
+"""A sweep, with one column per entry of the first axis of its grid.
+
+The rows show whether each set holds the truth, sizes and errors over time, and the paper's cases of the robots.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,7 @@ CASE_COLOURS = {"A": "#DDDDDD", "B": "#BBCCEE", "C": "#222255", "D": "#4477AA", 
 
 
 def draw_sweep(folder: Path, config: SweepConfig) -> Iterator[tuple[str, Figure]]:
-    """One figure; over a grid with a second line, one per entry of that line."""
+    """One figure. If the grid has a second axis, one figure per entry of it."""
     swept = Swept(folder, config)
     if len(config.axes) < 2:
         yield "figure", _draw(swept, None)
@@ -40,7 +42,7 @@ def draw_sweep(folder: Path, config: SweepConfig) -> Iterator[tuple[str, Figure]
 
 
 def _draw(swept: Swept, second: int | None) -> Figure:
-    """`second`: entry of the grid's second line; None: there is none."""
+    """One figure. `second` is the entry of the grid's second axis, or None if there is no such axis."""
     labels = swept.labels(0) if swept.config.axes else [[]]
     figure = Figure(figsize=(2.2 * len(labels) + 1.1, 7.4), layout="constrained")
     grid = figure.subplots(4, len(labels), sharey="row", squeeze=False, height_ratios=(2, 3.2, 3.2, 0.7))

@@ -1,4 +1,4 @@
-"""The paper's figures of a team: snapshots with every robot's region, and the regions' sizes beside the errors."""
+"""The paper's figures of a team: snapshots with every robot's region, and sizes of regions beside errors."""
 
 from __future__ import annotations
 
@@ -34,6 +34,7 @@ PANELS = (
 
 
 def draw_team(results: Results, config: SceneConfig) -> Figure:
+    """The figure of the snapshots."""
     columns = 2 if len(config.snapshots) > 1 else 1
     rows = math.ceil(len(config.snapshots) / columns)
     figure = Figure(figsize=(3.7 * columns, 3.75 * rows + 0.4), layout="constrained")
@@ -60,6 +61,7 @@ def draw_team(results: Results, config: SceneConfig) -> Figure:
 
 
 def draw_snapshot(axes: Axes, results: Results, config: SceneConfig, k: int) -> None:
+    """The map at sample k, with every robot's region."""
     discs = add_obstacles(axes, config)
     darken(axes, discs, config, [name for region in results.regions[k] for name in region.active])
     for i, robot in enumerate(config.robots):

@@ -1,1 +1,1 @@
-"""One run: a scene, constructed cases or a swarm is simulated, observed, and summed up."""
+"""One run: a scene, constructed cases or a swarm is simulated, observed and summarised."""

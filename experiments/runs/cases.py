@@ -1,11 +1,11 @@
-r"""Table I: a robot held in one of the paper's cases by bodies that move along with it.
+r"""Table I: a robot is held in one of the paper's cases by bodies that move along with it.
 
-A body at x + r n, n a unit vector, leaves the robot in this direction a speed that grows with its distance,
+A body at x + r n, with n a unit vector, limits the robot's speed in this direction. The limit s grows with r:
 
     n.u <= gamma/2 (r - Ds^2/r) = s      <=>      r = (s + sqrt(s^2 + gamma^2 Ds^2)) / gamma.
 
-So rows with any normals can be made to meet in one control: s = n.meet. The bodies are placed anew around the robot at
-every step, from nothing but its position; what it then does is the solution of its safety QP, and it moves on by that.
+So rows with any normals can be made to meet in one control, with s = n.meet. At every step the bodies are placed anew
+around the robot, from its position alone. The robot then moves by the solution of its safety QP.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from torchfsid.robots.simulation import closed_loop
 
 
 def run_cases(config: CasesConfig, out: Path, track: Track) -> dict[str, Any]:
-    """Simulate and observe; returns the summary."""
+    """Simulate, observe, and return the summary."""
     observers = Observers(config, record_cases(config))
     observe(observers, out, track)
     summary = measure_cases(Results(out, config), observers)
@@ -69,7 +69,11 @@ def record_cases(config: CasesConfig) -> Recording:
 
 
 def _places(case: CaseConfig, config: CasesConfig) -> tuple[Tensor, Tensor, Tensor]:
-    """Offsets (m, 2) of the bodies from the robot at the start, their radii (m,), and which slots are taken (m,)."""
+    """The bodies of a case.
+
+    Returns:
+        Offsets (m, 2) from the robot at the start [m], radii (m,) [m], and which slots hold a body (m,).
+    """
     slots, taken = _slots(config), len(case.bodies)
     gamma, margin = config.avoidance.class_k.gain, config.avoidance.margin
     assert margin is not None

@@ -1,6 +1,7 @@
 """The files in `configs/`: `kind: scene` is a robot or a team in closed loop, `kind: cases` is the paper's Table I.
 
-Each file is complete: nothing is inherited, and what is left out has the default written here. No torch in this module.
+Each file is complete: nothing is inherited. Keys that are left out have the defaults written here. This module does not
+import torch.
 """
 
 from __future__ import annotations
@@ -32,7 +33,13 @@ WholeNumber = Annotated[int, Field(strict=True, ge=0)]
 
 
 class RobotConfig(Strict):
-    """A robot, where it starts and where it wants to go [m]."""
+    """A robot.
+
+    Attributes:
+        name: its name.
+        start: where it starts [m].
+        goal: where it goes [m].
+    """
 
     name: BodyName
     start: PlanarVector
@@ -40,17 +47,26 @@ class RobotConfig(Strict):
 
 
 class ObstacleConfig(Strict):
-    """A body that stands still [m]."""
+    """A body that stands still.
+
+    Attributes:
+        name: its name.
+        position: its position [m].
+    """
 
     name: BodyName
     position: PlanarVector
 
 
 class MeasurementNoiseConfig(Strict):
-    """The errors of what the observer sees of the robots, of at most these lengths [m/s], [m].
+    """The errors of the measurements of the robots.
 
-    `shape`: `uniform` in discs; `bias`: one error of full length per robot, the same at all times; `adversarial`: of
-    full length, chosen at every sample by somebody who knows the truth and the observer (`experiments.runs.errors`).
+    Attributes:
+        velocity: bound on the length of velocity errors [m/s].
+        position: bound on the length of position errors [m].
+        shape: `uniform`: uniform in discs. `bias`: one error of full length per robot, constant over time.
+            `adversarial`: errors of full length, chosen at every sample with knowledge of the truth and the observer
+            (`experiments.runs.errors`).
     """
 
     velocity: NonNegative = 0.0
@@ -59,7 +75,13 @@ class MeasurementNoiseConfig(Strict):
 
 
 class ExpectedConfig(Strict):
-    """What the paper says is active until a time [s]: these bodies, or so many of them."""
+    """What the paper says is active until a time. Either `active` or `count` is given.
+
+    Attributes:
+        until: end of the interval [s].
+        active: names of the active bodies.
+        count: number of active bodies.
+    """
 
     until: Positive
     active: tuple[BodyName, ...] | None = None
@@ -73,14 +95,21 @@ class ExpectedConfig(Strict):
 
 
 class ExperimentConfig(Strict):
-    """What all experiments share: the declared model and the observers.
+    """The common part of all experiments: the declared model and the observers.
 
     Attributes:
-        title: of the figures.
-        dt, duration: sampling time and length of the run [s].
-        set: the set of the plain columns, of regions.json and of the hybrid estimate; the other one runs alongside.
+        kind: the kind of file.
+        title: title of the figures.
+        task: the task, whose goal is inferred.
+        barriers: the barriers, in the order of their rows.
+        dt: sampling time [s].
+        duration: length of the run [s].
+        prior: the prior set of a goal [m].
+        set: the set of the plain columns, of regions.json and of the hybrid estimate. The other set is computed
+            alongside.
         active_tolerance: distance to its boundary below which a row counts as active [m/s].
-        noise: bounds for the inverse-optimal set.
+        noise: bounds on errors, for the inverse-optimal set.
+        ukf: the filter.
     """
 
     kind: str
@@ -101,13 +130,15 @@ class ExperimentConfig(Strict):
 
     @property
     def safety_distance(self) -> float | None:
-        """Of the first barrier that has one [m]: the size in which bodies are drawn."""
+        """The safety distance of the first barrier that has one [m]. Bodies are drawn in this size."""
         distances = (getattr(barrier, "safety_distance", None) for barrier in self.barriers)
         return next((distance for distance in distances if distance is not None), None)
 
     def build_sets(self, kind: SetKind, task: Task, barriers: Sequence[Barrier], robots: int) -> SetMembershipObserver:
-        """The observer of one kind of set. The critical region knows no bound but its active tolerance: the bound also
-        decides on alarms."""
+        """The observer of one kind of set.
+
+        The critical region uses the active tolerance as its only bound, also to decide on alarms.
+        """
         from torchfsid.observers.set_membership import SetMembershipObserver
 
         noise = self.noise.build() if kind == "inverse_optimal" else None
@@ -134,9 +165,12 @@ class SceneConfig(ExperimentConfig):
     """A robot among obstacles, or a team in which every robot avoids every other.
 
     Attributes:
-        seed: of the measurement noise.
+        robots: the robots.
+        obstacles: bodies that stand still.
+        seed: seed of the measurement noise.
+        measurement_noise: errors of the measurements.
         snapshots: times of the figure's panels [s].
-        expected: the timeline of active obstacles to compare with; for scenes of one robot.
+        expected: the expected timeline of active obstacles, for scenes with one robot.
     """
 
     kind: Literal["scene"]
@@ -178,8 +212,14 @@ class SceneConfig(ExperimentConfig):
 
 
 class CaseBodyConfig(Strict):
-    """A body beside the robot: in which direction [deg], of which radius [m], and which speed its row leaves the robot
-    in that direction [m/s]. Without `speed`, the row goes through the case's `meet`: it is an active one."""
+    """A body beside the robot.
+
+    Attributes:
+        direction: direction from the robot to the body [deg].
+        radius: radius of the body [m].
+        speed: the speed to which its row limits the robot in this direction [m/s]. Default: the row goes through the
+            `meet` of the case, and is active.
+    """
 
     direction: Number
     radius: Positive
@@ -187,9 +227,13 @@ class CaseBodyConfig(Strict):
 
 
 class CaseConfig(Strict):
-    """One line of Table I: the bodies around a robot, and the letter of the case that they are to realise.
+    """One line of Table I.
 
-    `meet` is the control through which the active rows go, in the frame of the directions [m/s].
+    Attributes:
+        name: its name.
+        letter: the case that the bodies realise.
+        meet: the control at which the active rows meet, in the frame of the directions [m/s].
+        bodies: the bodies around the robot.
     """
 
     name: BodyName
@@ -199,11 +243,14 @@ class CaseConfig(Strict):
 
 
 class CasesConfig(ExperimentConfig):
-    """Constructed scenes in which a robot is held in one of the paper's cases by bodies that move along with it.
+    """Constructed cases: a robot is held in one of the paper's cases by bodies that move along with it.
 
     Attributes:
-        start, goal: of the robot, in every case [m]. radius: of the robot [m].
-        spin: how fast the directions turn [deg/s].
+        start: start of the robot, in every case [m].
+        goal: goal of the robot, in every case [m].
+        radius: radius of the robot [m].
+        spin: angular rate at which the directions turn [deg/s].
+        cases: the cases.
     """
 
     kind: Literal["cases"]
@@ -215,7 +262,7 @@ class CasesConfig(ExperimentConfig):
 
     @property
     def avoidance(self) -> AvoidanceConfig:
-        """The one barrier, whose rows the bodies' places are computed from."""
+        """The only barrier. The places of the bodies follow from its rows."""
         barrier = self.barriers[0]
         assert isinstance(barrier, AvoidanceConfig)
         return barrier
@@ -235,13 +282,18 @@ class CasesConfig(ExperimentConfig):
 
 
 class SwarmConfig(ExperimentConfig):
-    """Many robots in a square, each of which sees no more than its nearest neighbours. No filter runs along.
+    """Many robots in a square, each of which avoids its nearest neighbours only. There is no filter.
 
     Attributes:
-        robots: how many. side: of the square [m]. separation: between their starts [m].
+        robots: number of robots.
+        side: side of the square [m].
+        separation: least distance between starts [m].
         travel: goals lie in discs of this radius around the starts, within the square [m].
-        neighbours, sensing_radius: a robot avoids so many of its nearest neighbours within this distance [m].
-        seed: of everything random.
+        neighbours: number of nearest neighbours that a robot avoids.
+        sensing_radius: distance within which neighbours are avoided [m].
+        seed: seed of all random numbers.
+        measurement_noise: errors of the measurements.
+        snapshots: times of the figure's panels [s].
     """
 
     kind: Literal["swarm"]
@@ -257,7 +309,7 @@ class SwarmConfig(ExperimentConfig):
 
     @property
     def spacing(self) -> float:
-        """Of the grid that starts are moved away from [m]."""
+        """The spacing of the grid from whose points starts are displaced [m]."""
         return self.side / math.ceil(math.sqrt(self.robots))
 
     @model_validator(mode="after")
@@ -280,7 +332,7 @@ class SwarmConfig(ExperimentConfig):
 
 
 def require_increasing(times: Sequence[float], path: str) -> None:
-    """Raises, in a validator, the error for times that do not."""
+    """Check, in a validator, that times increase. `path` names the key in the message."""
     for before, after in pairwise(times):
         if not before < after:
             raise wrong(f"times must increase, got {after} after {before}", path)

@@ -1,10 +1,10 @@
-"""What is measured of a trajectory: every robot's position and velocity, with errors of at most the lengths declared.
+"""Measurements of a trajectory: positions and velocities of all robots, with errors within the declared bounds.
 
-The adversary knows the truth, the observer's model and its bounds. At every sample each robot's error is the one, out
-of `DIRECTIONS` for the position times `DIRECTIONS` for the velocity, whose half-spaces leave the true parameter the
-least room, given the errors that the neighbours had one sample before. Directions are counted from the normal of the
-robot's nearest row: "away from the neighbour, so that an active row looks inactive" is always among them. An error that
-makes the observer call out a violated row beats all others.
+The adversary knows the truth, the observer's model and its bounds. At every sample it tries `DIRECTIONS` errors of the
+position times `DIRECTIONS` errors of the velocity for each robot. It takes the pair whose half-spaces leave the true
+parameter the least room, given the neighbours' errors one sample before. Directions are counted from the normal of the
+robot's nearest row. So "away from the neighbour", which makes an active row look inactive, is always among them. An
+error that makes the observer report a violated row is preferred to all others.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ DIRECTIONS = 8
 
 
 def measure(true: Trajectory, config: SceneConfig) -> Trajectory:
-    """The trajectory as it is seen; obstacles are known exactly."""
+    """The trajectory with errors of measurement. Obstacles are known exactly."""
     random = np.random.default_rng(np.random.SeedSequence(config.seed))
     noise, robots = config.measurement_noise, true.robots
     if noise.shape == "adversarial":

@@ -1,5 +1,6 @@
-"""How large and how wrong everything is. Lengths are compared with lengths: of a region its diameter and the square
-root of its area, of an estimate its distance to the goal.
+"""Sizes of sets and errors of estimates, all as lengths.
+
+The lengths of a set are its diameter and the square root of its area. That of an estimate is its distance to the goal.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from experiments.runs.saved import SETS, Results
 
 
 def lengths(results: Results) -> dict[str, np.ndarray]:
-    """Everything that is compared, (times, robots) [m]."""
+    """All lengths by name: (times, robots) [m]."""
     measures = {"ukf": results.error("ukf_0", "ukf_1"), "hybrid": results.error("hybrid_0", "hybrid_1")}
     for kind in SETS:
         measures[f"{kind} sqrt_area"] = np.sqrt(results.of_set(kind, "volume"))
@@ -24,7 +25,7 @@ def lengths(results: Results) -> dict[str, np.ndarray]:
 
 
 def prior_lengths(results: Results) -> dict[str, np.ndarray]:
-    """The same before the first measurement, (robots,)."""
+    """The same lengths before the first measurement: (robots,) [m]."""
     lower, upper = np.array(results.config.prior.lower), np.array(results.config.prior.upper)
     distance = np.linalg.norm((lower + upper) / 2 - results.goals, axis=-1)
     regions = {"sqrt_area": math.sqrt(np.prod(upper - lower)), "diameter": float(np.linalg.norm(upper - lower))}

@@ -21,7 +21,7 @@ from torchfsid.robots.measurement import Measurement
 
 
 def observe(observers: Observers, out: Path, track: Track) -> None:
-    """Every sample is on disk before the next one is observed."""
+    """Observe the recording and write the files. A sample is on disk before the next one is observed."""
     recording = observers.recording
     first, *others = observers.sets
     alongside = {kind: observers.sets[kind] for kind in others}
@@ -57,7 +57,7 @@ def _regions(recording: Recording, measurement: Measurement, sets: dict[str, Set
 
 
 def _distinct(vertices: Tensor) -> Tensor:
-    """Padding repeats the first vertex at the end; an empty set has none."""
+    """The vertices without padding, which repeats the first vertex. An empty set has none."""
     vertices = vertices[vertices.isfinite().all(-1)]
     if len(vertices) == 0:
         return vertices

@@ -1,4 +1,4 @@
-"""The observers of an experiment, on the same data: both kinds of set, the filter, the hybrid."""
+"""The observers of an experiment, on the same measurements: both kinds of set, the filter, the hybrid."""
 
 from __future__ import annotations
 
@@ -20,9 +20,11 @@ class Observers:
     """The observers of a recording.
 
     Attributes:
-        sets: one per kind of set; the config's `set` is the first.
-        hybrid: joins the first with the filter.
-        tally: what was counted so far.
+        config: the configuration.
+        recording: the recording.
+        sets: one observer per kind of set. The first is the configuration's `set`.
+        hybrid: combines the first set with the filter.
+        tally: the counts so far.
     """
 
     config: ExperimentConfig
@@ -43,7 +45,7 @@ class Observers:
         self.tally = Tally(recording.goals, volumes, torch.diag(variances).expand(robots, -1, -1))
 
     def update(self, measurement: Measurement) -> tuple[HybridEstimate, dict[str, SetEstimate]]:
-        """What the hybrid says, and the estimates of all kinds of set."""
+        """The estimates of the hybrid and of all kinds of set, after one more measurement."""
         estimate = self.hybrid.update(measurement)
         first, *others = self.sets
         sets = {first: estimate.set_estimate, **{kind: self.sets[kind].update(measurement) for kind in others}}

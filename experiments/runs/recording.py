@@ -1,4 +1,4 @@
-"""A recording: what an observer will see of some robots, with the truth beside it."""
+"""A recording: the measurements of some robots, with the truth."""
 
 from __future__ import annotations
 
@@ -23,12 +23,13 @@ class Recording:
     """Measurements of a batch of robots, in the order of time.
 
     Attributes:
-        robots: their names.
-        goals: the truth [m].
-        task, barriers: the model, which is also what the observers assume.
-        row_names: for each row of the barriers, the body that it avoids or the row's label.
-        measurements: what is seen.
-        samples: how many there are.
+        robots: names of the robots.
+        goals: true goals [m].
+        task: the task, also of the observers.
+        barriers: the barriers, also of the observers.
+        row_names: for each row of the barriers, the body that it avoids, or else its label.
+        measurements: the measurements.
+        samples: number of measurements.
     """
 
     robots: list[str]
@@ -42,7 +43,15 @@ class Recording:
 
 @dataclass(frozen=True)
 class SimulatedScene:
-    """A scene that was run: the true trajectory, and what is measured of it."""
+    """A scene that was run.
+
+    Attributes:
+        config: the configuration.
+        task: the task.
+        barriers: the barriers.
+        true: the true trajectory.
+        measured: the trajectory with errors of measurement.
+    """
 
     config: SceneConfig
     task: Task
@@ -51,6 +60,7 @@ class SimulatedScene:
     measured: Trajectory
 
     def recording(self) -> Recording:
+        """The recording of the scene's robots."""
         labels = [label for barrier in self.barriers for label in barrier.labels(self.config.bodies)]
         return Recording(
             robots=[robot.name for robot in self.config.robots],
@@ -64,7 +74,7 @@ class SimulatedScene:
 
 
 def simulate_scene(config: SceneConfig) -> SimulatedScene:
-    """Run the scene's robots in closed loop, and measure them as well as the config says."""
+    """Run the scene's robots in closed loop, and measure them with the configured errors."""
     task = config.task.build(config.bodies)
     barriers: list[Barrier] = [barrier.build(config.bodies) for barrier in config.barriers]
     true = simulate(

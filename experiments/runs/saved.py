@@ -1,4 +1,4 @@
-"""The results folder of a scene or of constructed cases, read back. No torch in this module."""
+"""The results folder of a scene or of constructed cases, read back. This module does not import torch."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ SETS: tuple[Literal["critical_region", "inverse_optimal"], ...] = ("critical_reg
 
 @dataclass(frozen=True)
 class Region:
-    """What regions.jsonl says about a robot at one time.
+    """A line of regions.jsonl: one robot at one time.
 
     Attributes:
         active: names of the active rows.
-        vertices: of both kinds of set [m].
+        vertices: vertices of both kinds of set [m].
         rows: unit rows (a_x, a_y, b) over the control.
-        u, nominal: the control and the nominal one [m/s].
+        u: the control [m/s].
+        nominal: the nominal control [m/s].
     """
 
     active: list[str]
@@ -35,7 +36,12 @@ class Region:
 
 @dataclass(frozen=True)
 class Results:
-    """The folder of a run. Robots come in the order of the config, times increase."""
+    """The folder of a run. Robots have the order of the configuration, and times increase.
+
+    Attributes:
+        folder: the folder.
+        config: its configuration.
+    """
 
     folder: Path
     config: SceneConfig | CasesConfig
@@ -47,44 +53,45 @@ class Results:
 
     @cached_property
     def goals(self) -> np.ndarray:
-        """(robots, 2) [m]"""
+        """True goals: (robots, 2) [m]."""
         if isinstance(self.config, CasesConfig):
             return np.array([self.config.goal] * len(self.robots))
         return np.array([robot.goal for robot in self.config.robots])
 
     @cached_property
     def t(self) -> np.ndarray:
+        """Times [s]."""
         return self.numbers("t")[:, 0]
 
     def numbers(self, *columns: str) -> np.ndarray:
-        """Columns of estimates.csv: (times, robots), or with more than one (times, robots, columns)."""
+        """Columns of estimates.csv: (times, robots), or with more than one column (times, robots, columns)."""
         values = np.stack([self._by_robot(self._table.numbers(column)) for column in columns], axis=-1)
         return values[..., 0] if len(columns) == 1 else values
 
     def of_set(self, kind: str, *columns: str) -> np.ndarray:
-        """The same for the columns of one kind of set."""
+        """As `numbers`, for the columns of one kind of set."""
         prefix = "" if kind == self.config.set else f"{kind}_"
         return self.numbers(*(prefix + column for column in columns))
 
     def error(self, *columns: str) -> np.ndarray:
-        """Distances of point estimates to the goals: (times, robots) [m]"""
+        """Distances of point estimates to the goals: (times, robots) [m]."""
         return np.linalg.norm(self.numbers(*columns) - self.goals, axis=-1)
 
     def cases(self) -> np.ndarray:
-        """Letters, (times, robots)."""
+        """Letters of the cases: (times, robots)."""
         return self._by_robot(self._table["case"])
 
     def n_active(self) -> np.ndarray:
-        """(times, robots)"""
+        """Numbers of active rows: (times, robots)."""
         return self.numbers("n_active").astype(int)
 
     def at(self, t: float) -> int:
-        """The sample nearest to a time."""
+        """The index of the sample nearest to a time [s]."""
         return int(np.abs(self.t - t).argmin())
 
     @cached_property
     def regions(self) -> list[list[Region]]:
-        """By sample, then robot."""
+        """The regions by sample, then robot."""
         path, count = self.folder / "regions.jsonl", len(self.robots)
         with reading(path):
             lines = [_region(line) for line in read_lines(path)]
@@ -93,7 +100,7 @@ class Results:
 
     @cached_property
     def paths(self) -> dict[str, np.ndarray]:
-        """Of every body: (times, 2) [m]."""
+        """The positions of every body: (times, 2) [m]."""
         assert isinstance(self.config, SceneConfig)
         table, paths = read_columns(self.folder / "trajectory.csv"), {}
         for body in self.config.bodies:

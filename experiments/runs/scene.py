@@ -17,7 +17,7 @@ from torchfsid.robots.simulation import Trajectory
 
 
 def run_scene(config: SceneConfig, out: Path, track: Track) -> dict[str, Any]:
-    """Simulate and observe; returns the summary."""
+    """Simulate, observe, and return the summary."""
     scene = simulate_scene(config)
     write_trajectory(out / "trajectory.csv", config.bodies, scene.measured)
     observers = Observers(config, scene.recording())
@@ -26,7 +26,7 @@ def run_scene(config: SceneConfig, out: Path, track: Track) -> dict[str, Any]:
 
 
 def write_trajectory(path: Path, bodies: list[str], measured: Trajectory) -> None:
-    """All digits, so that an observer of the log sees what the observers of the run saw."""
+    """Write the measured trajectory with all digits, so that an observer of the log sees the same numbers."""
     names = "x", "y", "vx", "vy"
     write_rows(
         path,

@@ -1,6 +1,6 @@
-"""What a scene shows: the timeline of active obstacles, whether the promises held, and how fast each estimator was.
+"""The summary of a scene: the timeline of active obstacles, checks of the theory, and how fast estimators converge.
 
-A share (10 %, 1 %) is one of the value before the first measurement, that of the prior.
+A share (10 %, 1 %) refers to the value before the first measurement, that of the prior.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def summarise_scene(results: Results, observers: Observers, true: Trajectory) ->
 
 
 def settings(config: ExperimentConfig) -> dict[str, Any]:
-    """What every comparison depends on."""
+    """The settings on which every comparison depends."""
     lower, upper = np.array(config.prior.lower), np.array(config.prior.upper)
     spread = config.ukf.prior_std or ((upper - lower) / math.sqrt(12)).tolist()
     return {
@@ -84,15 +84,17 @@ def settings(config: ExperimentConfig) -> dict[str, Any]:
 
 
 def stays_below(t: np.ndarray, values: np.ndarray, bound: float) -> float | None:
-    """The first time from which on a value stays below a bound; None if it does not at the end. NaN, that of an empty
-    set, is not below."""
+    """The first time from which the value stays below the bound [s]. None if it is not below at the end.
+
+    NaN, the value of an empty set, is not below.
+    """
     above = np.flatnonzero(~(values < bound))
     first = above[-1] + 1 if len(above) else 0
     return float(t[first]) if first < len(t) else None
 
 
 def timeline(t: np.ndarray, active: Sequence[list[str]]) -> list[dict[str, Any]]:
-    """Intervals [from, until) of the same active rows; the last one has no end."""
+    """Intervals [from, until) with the same active rows. The last one has no end."""
     starts = [k for k in range(len(t)) if k == 0 or active[k] != active[k - 1]]
     ends = [*(float(t[k]) for k in starts[1:]), None]
     return [{"from": float(t[k]), "until": end, "active": active[k]} for k, end in zip(starts, ends, strict=True)]
@@ -101,8 +103,11 @@ def timeline(t: np.ndarray, active: Sequence[list[str]]) -> list[dict[str, Any]]
 def compare(
     t: np.ndarray, active: Sequence[list[str]], expected: Sequence[ExpectedConfig], dt: float
 ) -> dict[str, Any]:
-    """How far a timeline is from the expected one: away from an expected switch by more than its `deviation` [s], all
-    samples agree. A sample stands for the time until the next one."""
+    """Compare a timeline with the expected one.
+
+    Each expected switch gets the smallest `deviation` [s] such that all samples further away from the switch agree. A
+    sample stands for the time until the next one.
+    """
     deviations = [0.0] * len(expected)
     for time, names in zip(t, active, strict=True):
         middle = time + dt / 2

@@ -1,10 +1,10 @@
-"""A swarm in closed loop, observed as it goes: neither the trajectory nor the sets of the past are kept.
+"""A swarm in closed loop, observed as it moves. Neither the trajectory nor past sets are kept.
 
-Every robot avoids its nearest neighbours within the sensing radius, and the observer sees each robot among the same
-bodies. It does not count on the robots' ignoring all others: where the row of a body left out might have been active,
-a sample is not used (`torchfsid.neighbours`).
+Every robot avoids its nearest neighbours within the sensing radius, and the observer sees each robot among these
+bodies. The observer does not assume that the robots ignore all others. A sample is not used if the row of a body left
+out might have been active (`torchfsid.neighbours`).
 
-estimates.csv has the robots at the snapshots only: every sample of a thousand robots would be too much to write.
+estimates.csv has the robots at the snapshots only, to keep it small.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ QUANTILES = (0.1, 0.5, 0.9, 1.0)
 
 
 def run_swarm(config: SwarmConfig, out: Path, track: Track) -> dict[str, Any]:
-    """Simulate and observe; returns the summary."""
+    """Simulate, observe, and return the summary."""
     began = time.perf_counter()
     placing, measuring = map(np.random.default_rng, np.random.SeedSequence(config.seed).spawn(2))
     starts, goals = place(config, placing)
@@ -96,7 +96,7 @@ def place(config: SwarmConfig, random: np.random.Generator) -> tuple[Tensor, Ten
 def measurements(
     config: SwarmConfig, controller: CbfQpController, starts: Tensor, goals: Tensor, random: np.random.Generator
 ) -> Iterator[tuple[Measurement, Sample]]:
-    """Run the robots: sample by sample what is seen of them, and what they did."""
+    """Run the robots. For each sample, what is measured and what the robots did."""
 
     def among_nearest(t: float, x: Tensor, previous_u: Tensor, u: Tensor | None = None) -> Measurement:
         return nearest_bodies(t, x, u, previous_u=previous_u, count=config.neighbours, within=config.sensing_radius)
@@ -110,7 +110,7 @@ def measurements(
 
 
 def memory_mib() -> float:
-    """The most memory that this process has held so far."""
+    """The peak memory of this process so far [MiB]."""
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)
 
 
@@ -123,7 +123,7 @@ def _snapshot(measurement: Measurement, estimate: SetEstimate, size: Tensor, goa
 
 
 def _rounded(row: dict[str, Any]) -> dict[str, Any]:
-    """Six digits, for people and figures."""
+    """The table row with six significant digits, for people and figures."""
     return {name: f"{value:.6g}" if isinstance(value, float) else value for name, value in row.items()}
 
 

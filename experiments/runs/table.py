@@ -1,8 +1,8 @@
-"""Table I of the paper, measured: can a point estimator learn in each case, does the region shrink, and from what?
+"""Table I of the paper, measured: in each case, can a point estimator learn, and which rows shrink the region?
 
-A direction of the parameter counts as learned when the filter's standard deviation along it has fallen below
-`LEARNED` of the prior's; the filter can learn in so many directions as the rank of the sum of G'G dt says. A region
-shrinks if its area does. Facets tell from what: rows that had to stay inactive, or multipliers that are not negative.
+A direction of the parameter is learned if the filter's standard deviation along it falls below `LEARNED` of the
+prior's. The filter can learn in as many directions as the rank of the sum of G'G dt. A region shrinks if its area does.
+Its facets say why: rows that had to stay inactive, or multipliers that are not negative.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ PAPER = {"A": ("yes", "yes"), "B": ("yes", "yes"), "C": ("yes", "yes"), "D": ("n
 
 
 def measure_cases(results: Results, observers: Observers) -> dict[str, Any]:
-    """The content of summary.json; `cases` is also that of cases.csv."""
+    """The content of summary.json. Its `cases` are also the content of cases.csv."""
     config = observers.config
     assert isinstance(config, CasesConfig)
     return {
@@ -91,7 +91,7 @@ def _measure(i: int, results: Results, observers: Observers) -> dict[str, Any]:
 
 
 def print_cases(summary: dict[str, Any], console: Console) -> None:
-    """The measured table, for people; an answer that is not the paper's stands in red, with the paper's in brackets."""
+    """Print the measured table. An answer that differs from the paper's is red, with the paper's in brackets."""
     title = f"{summary['title']}: {summary['steps']} samples of {summary['settings']['dt']} s"
     headings = "case", "rank of\nΣG'G dt", "UKF error\n\\[m]", "point\nestimate?", "region's\narea \\[m²]"
     shown = table((*headings, "steps it\nshrank", "region?", "inv.-opt.\narea \\[m²]"), title=title)

@@ -1,4 +1,4 @@
-"""What a run counts as it goes on, because only then both the sets and the truth are at hand."""
+"""Counts taken during a run, while the sets and the truth are both in memory."""
 
 from __future__ import annotations
 
@@ -18,12 +18,14 @@ ROUND_OFF = 1e-9
 
 @dataclass
 class SetTally:
-    """Counts of steps, per robot, for one kind of set.
+    """Numbers of samples, per robot, for one kind of set.
 
     Attributes:
-        volume: at the last step, at first the prior's.
-        outside: the truth was not in the set. grew, shrank: the area did.
-        ukf_outside: the filter's estimate was not in the set.
+        volume: area of the set after the last sample, at first that of the prior.
+        outside: samples at which the truth was not in the set.
+        grew: samples at which the area grew.
+        shrank: samples at which the area shrank.
+        ukf_outside: samples at which the filter's estimate was not in the set.
     """
 
     volume: Float[Tensor, "B"]
@@ -37,6 +39,7 @@ class SetTally:
         self.outside, self.grew, self.shrank, self.ukf_outside = nothing, nothing, nothing, nothing
 
     def update(self, sets: FeasibleSet, goals: Float[Tensor, "B 2"], ukf: Float[Tensor, "B 2"]) -> None:
+        """Count one more sample."""
         volume = sets.volume()
         self.outside = self.outside + ~sets.contains(goals)
         self.ukf_outside = self.ukf_outside + ~sets.contains(ukf)
@@ -47,15 +50,16 @@ class SetTally:
 
 @dataclass
 class Tally:
-    """Counts of a run over both kinds of set, and how much its motions depended on the parameter.
+    """Counts of a run for both kinds of set, and how much the motions depended on the parameter.
 
     Attributes:
-        goals: the truth [m].
-        sets: by the name of the kind.
-        samples: so far.
-        information: sum of G'G dt, whose rank is the number of directions in which a motion can show the parameter.
-        rank: the largest rank of G at any step.
-        prior_covariance, covariance: the filter's, of the parameter, before the first and after the last sample.
+        goals: true goals [m].
+        sets: counts by kind of set.
+        prior_covariance: the filter's covariance of the parameter before the first sample.
+        covariance: the filter's covariance of the parameter after the last sample.
+        samples: number of samples so far.
+        information: sum of G'G dt. Its rank is the number of directions in which the motion can show the parameter.
+        rank: the largest rank of G at any sample.
     """
 
     goals: Float[Tensor, "B 2"]
@@ -72,6 +76,7 @@ class Tally:
         self.rank = torch.zeros(len(self.goals), dtype=torch.long)
 
     def update(self, estimate: HybridEstimate, sets: dict[str, SetEstimate], dt: float) -> None:
+        """Count one more sample of length `dt` [s]."""
         ukf = estimate.ukf_estimate
         for kind, of_kind in sets.items():
             self.sets[kind].update(of_kind.feasible_set, self.goals, ukf.theta)

@@ -1,4 +1,4 @@
-"""What a run shows, as a table for people; everything in it stands in summary.json."""
+"""The result of a run as a printed table. All of it is in summary.json."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ ESTIMATORS = {
 
 
 def print_verdict(summary: dict[str, Any], console: Console) -> None:
+    """Print the summary of a scene."""
     for robot, intervals in summary["timeline"].items():
         console.print(f"{robot}: " + "; ".join(map(_interval, intervals)), highlight=False)
     if "expected_timeline" in summary:

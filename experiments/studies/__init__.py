@@ -1,1 +1,1 @@
-"""Studies written for one page of the documentation each. No run needs them."""
+"""Studies, each for one page of the documentation. No run needs them."""

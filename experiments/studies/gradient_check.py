@@ -1,10 +1,10 @@
 """The gradient of a mean over goals (`probe.expectation`) against central differences of that mean.
 
-The same goals on both sides, so many that the jumps of single goals average out. Placements are drawn near the
-predicted path such that the probe matters, and that no difference steps across the safety distance: what is lost there
-is not seen by the gradient (docs/design.md).
+Both use the same goals, so many that the jumps of single goals average out. Placements are drawn near the predicted
+path, such that the probe matters and no difference crosses the safety distance. The gradient does not see what is lost
+there (docs/design.md).
 
-And where there is nothing to follow: the shares of placements from which the gradient is zero.
+A second study gives the shares of placements at which the gradient is zero.
 """
 
 from __future__ import annotations
@@ -39,8 +39,11 @@ OBJECTIVES: tuple[Objective, ...] = ("area", "log_area")
 
 
 def check_gradients(config: ProbePlacementConfig, seed: np.random.SeedSequence, track: Track) -> list[dict[str, Any]]:
-    """A row per number of way-points, horizon and objective: the cosine between both gradients over all placements, the
-    median and the least of single ones, the ratio of their lengths; and the same without the second term."""
+    """Compare both gradients. One table row per number of way-points, horizon and objective.
+
+    A table row has the cosine over all placements, the median and the least cosine of single ones, and the ratio of
+    lengths; and the same without the second term of the gradient.
+    """
     probing = Probing.of(config)
     settings = config.gradient_check
     jobs = [(K, horizon) for K in config.way_points for horizon in settings.horizons]
@@ -55,8 +58,11 @@ def check_gradients(config: ProbePlacementConfig, seed: np.random.SeedSequence, 
 
 
 def nothing_to_follow(config: ProbePlacementConfig, seed: np.random.SeedSequence) -> list[dict[str, Any]]:
-    """A row per number of way-points and way of drawing: the share of placements from which the gradient is zero, and
-    the share of outcomes (a placement with a goal) that do not count."""
+    """Shares of zero gradients. One table row per number of way-points and way of drawing.
+
+    A table row has the share of placements at which the gradient is zero, and the share of outcomes (one placement with
+    one goal) that do not count.
+    """
     probing, rows = Probing.of(config), []
     goals = probing.draw_goals(config.goals.train, int(seed.generate_state(1)[0]))
     for K, child in zip(config.way_points, seed.spawn(len(config.way_points)), strict=True):
@@ -93,7 +99,13 @@ def _fit_for_it(search: Search, horizon: int) -> Tensor:
 
 
 class _Gradients(NamedTuple):
-    """Of the mean over goals: by automatic differentiation, that without the score term, by central differences."""
+    """Gradients of the mean over goals.
+
+    Attributes:
+        whole: by automatic differentiation.
+        smooth_part: by automatic differentiation, without the score term.
+        differences: by central differences.
+    """
 
     whole: Tensor
     smooth_part: Tensor

@@ -1,8 +1,8 @@
-"""What automatic differentiation does not see: the area that one goal leaves jumps where its active sets switch.
+"""What automatic differentiation does not see: the area for one goal jumps where its active sets switch.
 
-A probe that stands still is moved along y, across the corridor. Between two switches of the history of active sets, A
-is smooth in its place and automatic differentiation gives d log A/dy; at a switch A jumps, and what it gives is the
-derivative of one side. What these derivatives add up to is therefore not how log A changes.
+A still probe is moved along y, across the corridor. Between two switches of the history of active sets, A is smooth and
+automatic differentiation gives d log A/dy. At a switch A jumps, and automatic differentiation gives a one-sided
+derivative. So the integral of these derivatives differs from the change of log A.
 """
 
 from __future__ import annotations
@@ -25,8 +25,11 @@ PLACES = 801
 
 
 def across(probing: Probing, place: Float[Tensor, "2"], goal: Float[Tensor, "2"]) -> list[dict[str, Any]]:
-    """A row per place: log of the area [m^2], what its derivatives add up to from the first place, the number of
-    switches up to there. Places that are not allowed are left out."""
+    """Move a still probe across the corridor. One table row per allowed place.
+
+    A table row has the log of the area [m^2], the integral of the derivatives from the first place, and the number of
+    switches so far.
+    """
     places = place.repeat(PLACES, 1, 1)
     places[:, 0, 1] += torch.linspace(-REACH, REACH, PLACES, dtype=torch.float64)
     places = places[(probing.allowed(places) == places).flatten(1).all(-1)].requires_grad_()
@@ -50,7 +53,7 @@ def across(probing: Probing, place: Float[Tensor, "2"], goal: Float[Tensor, "2"]
 
 
 def summarise_switches(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """How often the history switches, how log A changes along the way, and what its derivatives add up to."""
+    """The number of switches, the change of log A along the way, and the integral of the derivatives."""
     first, last = rows[0], rows[-1]
     return {
         "way [m]": last["y"] - first["y"],

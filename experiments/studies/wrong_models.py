@@ -1,9 +1,9 @@
-"""What an observer says when its model is wrong. `python -m experiments.studies.wrong_models` prints the table.
+"""What an observer reports when its model is wrong. `python -m experiments.studies.wrong_models` prints the table.
 
-Teams of four robots cross a disc with two pillars, one joint QP over each team (`neighbour_velocity: current`), with
-random goals. Controls are measured with errors of a given size, in random directions. Each model is wrong in one thing.
-A robot is silent while its status is `ok` and the truth is not in its set, or there is no truth because its task is
-another one. It must not end so: docs/wrong_models.md says when it does, and why it cannot be helped then.
+Teams of four robots cross a disc with two pillars to random goals, with one joint QP per team (`neighbour_velocity:
+current`). Controls are measured with errors of a given size in random directions. Each model is wrong in one thing. A
+robot is silent if its status is `ok` but its set does not hold the truth, or the task has no such truth. It must not
+end silent. docs/wrong_models.md says when it does, and why that cannot be avoided.
 """
 
 from __future__ import annotations
@@ -41,11 +41,15 @@ LEVELS = ((1e-6, 0.0), (0.02, 0.02), (0.02, 0.002))
 
 @dataclass(frozen=True)
 class Belief:
-    """What an observer believes, and what it is given to see of the runs.
+    """The model that an observer assumes, and the measurements that it gets.
 
     Attributes:
+        name: name of the table row.
+        task: the assumed task.
+        barriers: the assumed barriers.
         run: the task that the robots really have.
-        seen: changes the measurements. errors: multiply the size of the errors.
+        seen: function applied to the measurements.
+        errors: factor on the size of the errors.
     """
 
     name: str
@@ -62,7 +66,7 @@ def without_last_pillar(samples: list[Measurement]) -> list[Measurement]:
 
 
 def shifted(by: int) -> Callable[[list[Measurement]], list[Measurement]]:
-    """Velocities of so many samples later, also the neighbours'."""
+    """Take velocities, the neighbours' included, from this number of samples later."""
 
     def shift(samples: list[Measurement]) -> list[Measurement]:
         pairs = zip(samples[max(0, -by) :], samples[max(0, by) :], strict=False)
@@ -100,10 +104,13 @@ class Ending:
     """How the robots of all runs end.
 
     Attributes:
-        flagged: robots whose status is not ok. right: ok, and the truth is inside. silent: ok, and it is not.
-        away: how far it is outside, at most [m].
-        delay: the longest time that a robot's status was ok with the truth outside [s].
-        strained: robots that end ok and need more than half of the bound; strained_silent: silent ones among them.
+        flagged: robots whose status is not `ok`.
+        right: robots with status `ok` and the truth in the set.
+        silent: robots with status `ok` and the truth outside.
+        away: largest distance of the truth from such a set [m].
+        delay: longest time for which a status was `ok` with the truth outside [s].
+        strained: robots that end `ok` and need more than half of the bound.
+        strained_silent: silent robots among the strained ones.
     """
 
     flagged: int
@@ -116,7 +123,7 @@ class Ending:
 
 
 def simulated(task: Task, seeds: int) -> tuple[list[Trajectory], Tensor]:
-    """One run per seed, and the robots' goals."""
+    """One run per seed, and the goals of all robots [m]."""
     runs, goals = [], []
     for sequence in torch.arange(seeds).tolist():
         generator = torch.Generator().manual_seed(sequence)
@@ -134,7 +141,7 @@ def simulated(task: Task, seeds: int) -> tuple[list[Trajectory], Tensor]:
 
 
 def measured(runs: Sequence[Trajectory], error: float) -> list[Measurement]:
-    """The robots of all runs as one batch, with errors of this size [m/s] in their velocities."""
+    """The robots of all runs as one batch, with velocity errors of this size [m/s]."""
     generator = torch.Generator().manual_seed(len(runs))
     noisy = []
     for run in runs:
@@ -154,7 +161,7 @@ def joined(teams: Sequence[Measurement]) -> Measurement:
 
 
 def ending(belief: Belief, samples: list[Measurement], goals: Tensor, noise: NoiseBound) -> Ending:
-    """Observe all runs with a belief."""
+    """Observe all runs with the model of the belief."""
     observer = SetMembershipObserver(belief.task, belief.barriers, prior(goals), noise=noise)
     has_truth = isinstance(belief.task, GoalTask)
     steps = torch.zeros(len(goals))
@@ -185,12 +192,12 @@ def prior(goals: Tensor) -> FeasibleSet:
 
 
 def automatic(belief: Belief, samples: list[Measurement], goals: Tensor, neighbour_velocity: float) -> NoiseBound:
-    """What `velocity: auto` takes for each run, for all its robots."""
+    """The bounds that `velocity: auto` takes, one per run for all its robots."""
     consistency = Consistency(
         samples, belief.task, belief.barriers, prior(goals), neighbour_velocity=neighbour_velocity
     )
     smallest = consistency.smallest_bounds(consistency.fastest).unflatten(0, (-1, ROBOTS)).amax(-1)
-    # Where there is no such bound the command ends with an error, which is as good as a flag: take what is refuted.
+    # Without such a bound the command ends with an error, which is as good as a flag: take a bound that is refuted.
     smallest = torch.where(smallest.isfinite(), smallest, 0.0)
     return NoiseBound(AUTO_FACTOR * smallest.repeat_interleave(ROBOTS), neighbour_velocity=neighbour_velocity)
 

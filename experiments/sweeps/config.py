@@ -1,9 +1,9 @@
 """The files of `python -m experiments sweep`: many runs of a scene, over a grid, with random teams.
 
-`experiment` is a scene (`experiments.runs.config`) without what the sweep fills in: `title`, `seed`, `snapshots`, and,
-where a `team` is to be drawn, `robots` and `obstacles`. Every point of the grid is run `repeats` times. Run i draws all
-that is random from child i of one `numpy.random.SeedSequence`: it is the same run in whatever order, on however many
-workers. No torch in this module.
+`experiment` is a scene (`experiments.runs.config`) without what the sweep fills in: `title`, `seed`, `snapshots`, and
+with a `team`, `robots` and `obstacles`. Every point of the grid is run `repeats` times. Run i draws all its random
+numbers from child i of one `numpy.random.SeedSequence`. So it is the same run in any order, on any number of workers.
+This module does not import torch.
 """
 
 from __future__ import annotations
@@ -37,12 +37,15 @@ class SweepConfig(Strict):
     """A sweep.
 
     Attributes:
-        seed: of everything random. repeats: runs per point of the grid.
-        times: at which sizes and errors are kept [s].
-        experiment: the scene, see above; keys of it are written with dots, as in `barriers.0.safety_distance`.
+        title: title of the figures.
+        seed: seed of all random numbers.
+        repeats: runs per point of the grid.
+        times: times at which sizes and errors are recorded [s].
+        experiment: the scene. In `draw` and `grid` its keys are written with dots, as in `barriers.0.safety_distance`.
         draw: keys of the experiment that each run draws uniformly between two numbers.
-        grid: keys of the experiment, and the values that they take. Keys joined by commas take theirs together: each
-            entry is then a list, one value per key. The first line of the grid is the one that figures compare.
+        grid: the axes of the grid: keys of the experiment, and the values that they take. Keys joined by commas take
+            values together, and each entry is then a list with one value per key. Figures compare the entries of the
+            first axis.
     """
 
     kind: Literal["sweep"]
@@ -60,23 +63,30 @@ class SweepConfig(Strict):
 
     @cached_property
     def axes(self) -> list[list[dict[str, Any]]]:
-        """The lines of the grid: for each of its entries a value for each of its keys."""
+        """The axes of the grid. Each entry of an axis has a value for each of its keys."""
         return [[_level(keys, values) for values in entries] for keys, entries in self.grid.items()]
 
     @cached_property
     def points(self) -> list[dict[str, Any]]:
-        """The grid: a value for each of its keys, point by point."""
+        """The points of the grid, with a value for each key."""
         return [dict(ChainMap(*reversed(levels))) for levels in itertools.product(*self.axes)]
 
     def point(self, run: int) -> dict[str, Any]:
         return self.points[run // self.repeats]
 
     def scene(self, run: int) -> SceneConfig:
-        """What run number `run` (from 0) is. Raises `ConfigError` if that is not a scene."""
+        """The scene of a run.
+
+        Args:
+            run: number of the run, from 0.
+
+        Raises:
+            ConfigError: it is not a valid scene.
+        """
         return validate(self.scene_mapping(run), SceneConfig, f"experiment of run {run}{_told(self.point(run))}")
 
     def scene_mapping(self, run: int) -> dict[str, Any]:
-        """The same, not yet validated."""
+        """The scene of a run as a mapping, not yet validated."""
         values = {**self.point(run), **self.drawn(run)}
         mapping = apply_overrides(self.experiment, [f"{key}={json.dumps(value)}" for key, value in values.items()])
         _, placing, measuring = self._seeds(run)
@@ -87,12 +97,16 @@ class SweepConfig(Strict):
         return {**mapping, "title": self.title, "seed": seed, "snapshots": [0.0]}
 
     def drawn(self, run: int) -> dict[str, float]:
-        """What this run draws."""
+        """The values that this run draws."""
         random = np.random.default_rng(self._seeds(run)[0])
         return {key: float(random.uniform(low, high)) for key, (low, high) in self.draw.items()}
 
     def check_runs(self, source: str) -> None:
-        """Raises `ConfigError` if the first run of some point of the grid is not a scene."""
+        """Check the first run of every point of the grid.
+
+        Raises:
+            ConfigError: it is not a valid scene. The message names `source`.
+        """
         for run in range(0, self.runs, self.repeats):
             try:
                 scene = self.scene(run)
@@ -104,7 +118,7 @@ class SweepConfig(Strict):
                 )
 
     def _seeds(self, run: int) -> list[np.random.SeedSequence]:
-        """For drawing, for placing the team, for measuring."""
+        """Seeds for drawing values, for placing the team, and for measuring."""
         return np.random.SeedSequence(self.seed, spawn_key=(run,)).spawn(3)
 
     @model_validator(mode="after")
@@ -135,8 +149,13 @@ class _Team(Strict):
 
 
 def override_sweep(mapping: dict[Any, Any], overrides: Iterable[str]) -> dict[Any, Any]:
-    """`apply_overrides` for a sweep: what follows `draw.` or `grid.` is one key, dots and commas included, as in
-    "draw.task.gain=[1, 2]". Raises `ConfigError` as that does."""
+    """`apply_overrides` for a sweep. What follows `draw.` or `grid.` is one key, dots and commas included.
+
+    An example is "draw.task.gain=[1, 2]".
+
+    Raises:
+        ConfigError: see `apply_overrides`.
+    """
     for override in overrides:
         path, _, text = override.partition("=")
         section, dot, joined = path.partition(".")

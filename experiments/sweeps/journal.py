@@ -1,8 +1,8 @@
-"""What has been finished, on disk: one line of JSON per run, appended and synced as runs finish, in whatever order.
+"""The journal of a sweep: one line of JSON per finished run, appended and synced in the order of finishing.
 
-A process that is killed leaves at worst a last line without its end; it is cut off when the journal is opened again.
-Any other line that is not JSON (a damaged disk) is passed over. Either way its run is run again, and no whole line is
-ever touched.
+A process that is killed may leave a last line without its end. It is cut off when the journal is opened again. Any
+other line that is not JSON (a damaged disk) is ignored. In both cases the run is run again. Whole lines are never
+changed.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from experiments.results import Appender
 
 
 class Journal(Appender):
-    """Use it as a context manager.
+    """The journal, as a context manager.
 
     Attributes:
-        records: the whole lines, by run.
+        records: the records of whole lines, by number of the run.
     """
 
     def __init__(self, path: Path):
@@ -31,7 +31,7 @@ class Journal(Appender):
         self.records: dict[int, dict[str, Any]] = {record["run"]: record for record in records}
 
     def add(self, record: dict[str, Any]) -> None:
-        """Once this returns, the record survives a crash."""
+        """Append a record. After the return it survives a crash."""
         self.append(json.dumps(record, allow_nan=False) + "\n")
         os.fsync(self.file.fileno())
         self.records[record["run"]] = record

@@ -1,7 +1,7 @@
-"""What one run of a sweep leaves: a row of the table, and sizes and errors at some times.
+"""The record of one run of a sweep: a table row, and sizes and errors at some times.
 
 Sizes are the square root of the area, the diameter, and the distances of point estimates from the goal [m]. A set is
-lost from the first sample at which it does not hold the truth, in silence if its status ends as `ok`.
+lost from the first sample at which it does not hold the truth. It is lost in silence if its status ends as `ok`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,12 @@ EXACTLY_ACTIVE = 1e-9
 
 
 def observed(scene: SceneConfig, times: tuple[float, ...]) -> dict[str, Any]:
-    """Simulate and observe a scene: its `row`, its `series` at the samples nearest to `times`, its `seconds`."""
+    """Simulate and observe a scene.
+
+    Returns:
+        A mapping with the table row of the run (`row`), sizes and errors at the samples nearest to `times` [s]
+            (`series`), and durations (`seconds`).
+    """
     torch.set_num_threads(1)  # small tensors: more threads only wait for each other
     began = time.perf_counter()
     simulated = simulate_scene(scene)
@@ -72,7 +77,7 @@ def observed(scene: SceneConfig, times: tuple[float, ...]) -> dict[str, Any]:
 
 
 def _true_cases(scene: SimulatedScene, exact: Measurement) -> tuple[Tensor, Tensor]:
-    """The paper's case of every robot, and the rows that are really active."""
+    """The true case of every robot, and the truly active rows."""
     rows = stack_barriers(scene.barriers, exact)
     active = active_set(rows, _control(exact), EXACTLY_ACTIVE)
     return solve_kkt(rows, active, *scene.task(exact)).case, active
@@ -84,7 +89,7 @@ def _control(measurement: Measurement) -> Tensor:
 
 
 def _sizes(estimate: HybridEstimate, sets: dict[str, SetEstimate], goals: Tensor) -> dict[str, Tensor]:
-    """Of every robot, by name."""
+    """Sizes and errors of every robot, by name [m]."""
     sizes = {}
     for kind in SETS:
         theta = sets[kind].feasible_set
@@ -123,11 +128,11 @@ def _of_set(observers: Observers, kind: str, lost_since: Tensor) -> dict[str, An
 
 
 def _first(events: list[Event], status: Status, name: str) -> dict[str, Any]:
-    """How many robots, and when the first."""
+    """The number of robots with this status, and the time of the first."""
     times = [event.t for event in events if event.status == status]
     return {name: len(times), f"{name}_since": _rounded(min(times)) if times else None}
 
 
 def _rounded(value: float) -> float | None:
-    """Six digits: the tables are for people and figures. None if it is not finite."""
+    """The value with six significant digits, for people and figures. None if it is not finite."""
     return float(f"{value:.6g}") if math.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""What a sweep shows, point by point of its grid: summary.json, and a table for people."""
+"""The summary of a sweep for each point of its grid: summary.json, and a printed table."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def _quantiles(values: np.ndarray) -> list[float] | None:
 
 
 def print_sweep(summary: dict[str, Any], console: Console) -> None:
-    """Robots whose set lost the truth, and medians at the end, for each point of the grid."""
+    """Print for each point of the grid the robots whose set lost the truth, and medians at the end."""
     numbers = "runs", "robots", "paper's lost", "silently", "√area", "inv.-opt. lost", "√area", "UKF", "hybrid"
     texts, numbers = ([heading.replace(" ", "\n") for heading in of] for of in (summary["keys"], numbers))
     shown = table(texts, numbers)

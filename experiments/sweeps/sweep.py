@@ -1,7 +1,7 @@
-"""Run what is missing of a sweep, and write its tables.
+"""Run the missing runs of a sweep, and write its tables.
 
-Workers only compute; this process alone writes. The tables are made from the journal and sorted by run, so they are the
-same, byte for byte, for any number of workers and interruptions. timings.csv alone is not.
+Workers only compute, and only this process writes. The tables are made from the journal and sorted by run. So they are
+identical for any number of workers and interruptions, except timings.csv.
 """
 
 from __future__ import annotations
@@ -20,8 +20,16 @@ from torchfsid.errors import FsidError, one_line
 
 
 def run_sweep(config: SweepConfig, out: Path, track: Track, team: Workers | None = None) -> dict[str, Any]:
-    """Finish the sweep in folder `out`, and return its summary. Interrupted in whatever way, it goes on from there when
-    called again. Without a `team`, this process does the work."""
+    """Finish the sweep in the folder `out`, and return its summary.
+
+    After an interruption a second call goes on with the missing runs.
+
+    Args:
+        config: the sweep.
+        out: the folder.
+        track: shows progress.
+        team: the workers. None: this process does the work.
+    """
     with Journal(out / "records.jsonl") as journal, workers() as alone:
         missing = [run for run in range(config.runs) if run not in journal.records]
         finished = config.runs - len(missing)
@@ -35,7 +43,7 @@ def run_sweep(config: SweepConfig, out: Path, track: Track, team: Workers | None
 
 
 def record(config: SweepConfig, run: int) -> dict[str, Any]:
-    """Run number `run`, as the journal keeps it. A run that fails on purpose is a row with an error, not the end."""
+    """The record of one run for the journal. A run that fails becomes a record with an error, and the sweep goes on."""
     try:
         return {"run": run, "error": "", **observed(config.scene(run), config.times)}
     except FsidError as error:

@@ -1,4 +1,4 @@
-"""The folder of a sweep, read back: all that its summary and its figures are made from. No torch in this module."""
+"""The folder of a sweep, read back for its summary and its figures. This module does not import torch."""
 
 from __future__ import annotations
 
@@ -19,7 +19,12 @@ from torchfsid.errors import FigureError
 
 @dataclass(frozen=True)
 class Swept:
-    """Columns of its tables are those of `experiments.sweeps.record`; runs that failed are left out."""
+    """The tables of a sweep, with the columns of `experiments.sweeps.record`. Failed runs are left out.
+
+    Attributes:
+        folder: the folder.
+        config: the sweep.
+    """
 
     folder: Path
     config: SweepConfig
@@ -30,7 +35,11 @@ class Swept:
 
     @cached_property
     def runs(self) -> Columns:
-        """Raises `FigureError` if not a single run succeeded."""
+        """The runs that succeeded.
+
+        Raises:
+            FigureError: every run failed.
+        """
         succeeded = self.all_runs.where(error="")
         if not len(succeeded["run"]):
             raise FigureError(f"{self.folder}: every run failed, as with: {self.all_runs['error'][0]}")
@@ -46,19 +55,19 @@ class Swept:
 
     @cached_property
     def point_of(self) -> np.ndarray:
-        """For each run number its point of the grid, as one index per line of the grid: (runs, lines)."""
+        """The point of the grid of each run, as one index per axis: (runs, axes)."""
         shape = [len(axis) for axis in self.config.axes]
         points = np.arange(self.config.runs) // self.config.repeats
         return np.stack(np.unravel_index(points, shape), axis=-1) if shape else np.zeros((len(points), 0), dtype=int)
 
     def chosen(self, table: Columns, levels: tuple[int, ...]) -> Columns:
-        """Rows of `runs` or `series` at these entries of the first lines of the grid."""
+        """Table rows of `runs` or `series` at these entries of the first axes."""
         with reading(table.path):
             point = self.point_of[table["run"].astype(int)]
         return table.rows((point[:, : len(levels)] == levels).all(-1))
 
     def telling(self, axis: int) -> list[str]:
-        """The first keys of a line of the grid: as many as tell its entries apart."""
+        """The first keys of an axis, as many as distinguish its entries."""
         levels = self.config.axes[axis]
         keys = list(levels[0])
         for count in range(1, len(keys)):
@@ -67,19 +76,19 @@ class Swept:
         return keys
 
     def labels(self, axis: int) -> list[list[str]]:
-        """The values of these keys, entry by entry."""
+        """The values of the keys `telling(axis)`, for each entry of the axis."""
         keys = self.telling(axis)
         return [[_value(key, level[key]) for key in keys] for level in self.config.axes[axis]]
 
 
 def quantiles(values: np.ndarray, at: Sequence[float]) -> np.ndarray:
-    """Of the finite values: the others are of empty sets. NaN without any."""
+    """Quantiles of the finite values. The others belong to empty sets. NaN if no value is finite."""
     finite = values[np.isfinite(values)]
     return np.quantile(finite, at) if len(finite) else np.full(len(at), np.nan)
 
 
 def short(key: str) -> str:
-    """A key as people say it."""
+    """The last part of a key, with spaces."""
     return key.rsplit(".", 1)[-1].replace("_", " ")
 
 

@@ -1,4 +1,4 @@
-"""The tables of a sweep, from its journal, as CSV and Parquet; and read back. No torch in this module."""
+"""The tables of a sweep: written from its journal as CSV and Parquet, and read back. No import of torch."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from experiments.sweeps.config import SweepConfig
 
 
 def write_tables(out: Path, config: SweepConfig, records: list[dict[str, Any]]) -> None:
-    """runs, series and timings of the finished runs, each file whole or not at all."""
+    """Write runs, series and timings of the finished runs, each file whole or not at all."""
     if not records:
         return
     varied = [_varied(config, record["run"]) for record in records]
@@ -36,26 +36,26 @@ def write_tables(out: Path, config: SweepConfig, records: list[dict[str, Any]]) 
 
 
 def read_table(path: Path) -> Columns:
-    """The columns of a Parquet file; numbers that are missing are NaN."""
+    """The columns of a Parquet file. Missing numbers are NaN."""
     with reading(path):
         table = pyarrow.parquet.read_table(path)
         return Columns(path, {name: table[name].to_numpy() for name in table.column_names})
 
 
 def _varied(config: SweepConfig, run: int) -> dict[str, Any]:
-    """What the grid and the drawing gave this run; lists and the like as JSON."""
+    """The values that the grid and the drawing give this run. Lists and the like are JSON."""
     values = {**config.point(run), **config.drawn(run)}
     return {key: value if isinstance(value, int | float | str) else json.dumps(value) for key, value in values.items()}
 
 
 def _table(rows: list[dict[str, Any]]) -> pa.Table:
-    """Columns in the order in which they first come; a row may lack some (a run that failed)."""
+    """A table with columns in the order in which they first appear. A failed run may lack some."""
     names = dict.fromkeys(["run", *(name for row in rows for name in row)])
     return pa.table({name: _column([row.get(name) for row in rows]) for name in names})
 
 
 def _column(values: list[Any]) -> pa.Array:
-    """Numbers, or text where not all are numbers."""
+    """A column of numbers, or of texts if not all values are numbers."""
     if all(value is None for value in values):
         return pa.array(values, pa.float64())
     if all(isinstance(value, int | float | None) for value in values):

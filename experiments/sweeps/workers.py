@@ -1,4 +1,4 @@
-"""Who works on a sweep: cores of this machine, or a Dask cluster."""
+"""The workers of a sweep: processes on this computer, or a Dask cluster."""
 
 from __future__ import annotations
 
@@ -23,20 +23,23 @@ Workers = Callable[[Callable[..., Any], Iterable[tuple[Any, ...]]], Iterator[Any
 
 
 class WorkersError(FsidError):
-    """The workers have gone: what was done before stands."""
+    """The workers are gone, for lack of memory or because the cluster broke down.
+
+    Finished runs are kept. The same command goes on from there.
+    """
 
 
 @contextmanager
 def workers(jobs: int = 1, dask: str | None = None) -> Iterator[Workers]:
-    """Workers for a while.
+    """In this block there are workers.
 
     Args:
-        jobs: processes on this machine; -1: one per core.
+        jobs: number of processes on this computer. -1: one per core.
         dask: address of a Dask scheduler to use instead.
 
     Raises:
         ConfigError: joblib or Dask is not installed, or there is no such scheduler.
-        WorkersError: the cluster has broken down.
+        WorkersError: the cluster broke down.
     """
     if dask is None:
         yield partial(_here, jobs)

@@ -1,6 +1,4 @@
-"""The figure of an observed log, from its saved results: final regions over the trajectories, sizes and cases over
-time.
-"""
+"""The figure of an observed log, from its saved results: regions over trajectories, sizes and cases over time."""
 
 from __future__ import annotations
 

@@ -29,8 +29,11 @@ class Interrupted(KeyboardInterrupt):
 
 
 class _Now:
-    """How a signal is answered now, and which signal waits. Signals come to the process, so this is state of the
-    process.
+    """How the process answers a signal now.
+
+    Attributes:
+        does: raise `Interrupted`, wait for the end of a block, or exit on the spot.
+        waiting: the signal that waits, or None.
     """
 
     does: Literal["raise", "wait", "exit"] = "raise"
@@ -39,9 +42,7 @@ class _Now:
 
 @contextlib.contextmanager
 def interruptible(program: str) -> Iterator[None]:
-    """In this block signals raise `Interrupted`. Signals that the process ignored from the start (`nohup`) stay
-    ignored.
-    """
+    """In this block signals raise `Interrupted`. Those that the process ignores from the start (`nohup`) do not."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

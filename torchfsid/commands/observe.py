@@ -108,8 +108,7 @@ class Observation:
         return self.config.noise.velocity
 
     def strained(self) -> list[str]:
-        """Robots that end `ok` but need more than half of the velocity bound. An error of the model may hide in the
-        bound.
+        """Robots that end `ok` but need more than half of the velocity bound: it may hide an error of the model.
 
         This is no alarm, since errors may be as large as declared. The list is empty where the question has no meaning
         (the bound was determined from the log, sets are reset, critical regions) or takes too long (theta is not

@@ -70,9 +70,7 @@ class Log:
 
     @property
     def previous_known(self) -> Bool[np.ndarray, "times bodies"]:
-        """Is the body's velocity one sample earlier known? It is not at the log's first sample, nor at the body's
-        first.
-        """
+        """Is the body's velocity one sample earlier known? Not at the first sample of the log or of the body."""
         return _one_earlier(self.velocity_known)
 
     def differentiated(self) -> Log:
