@@ -39,6 +39,7 @@ Edge = tuple[Fraction, Fraction, Fraction]
 
 
 def truths(batch: int, seed: int) -> np.ndarray:
+    """True points, (batch, 2)."""
     return np.random.default_rng(seed).uniform(-5, 5, (batch, 2))
 
 
@@ -70,6 +71,7 @@ class Exact:
         ]
 
     def update(self, A: np.ndarray, b: np.ndarray) -> None:
+        """Intersect with A z <= b."""
         for (p, q), c in zip(A.tolist(), b.tolist(), strict=True):
             row = Fraction(p), Fraction(q), Fraction(c)
             over = [row[0] * x + row[1] * y - row[2] for (x, y), _ in self.ring]
@@ -86,11 +88,13 @@ class Exact:
             self.ring = kept
 
     def area(self) -> float:
+        """The area, rounded to a double."""
         points = [point for point, _ in self.ring]
         following = points[1:] + points[:1]
         return float(sum((x * w - y * v for (x, y), (v, w) in zip(points, following, strict=True)), Fraction(0)) / 2)
 
     def rows(self) -> Rows:
+        """The irredundant rows as doubles."""
         table = np.array([[float(part) for part in edge] for _, edge in self.ring])
         return table[:, :2], table[:, 2]
 

@@ -49,6 +49,7 @@ def corners(batch: int) -> tuple[Tensor, Tensor]:
 
 
 def by_implicit_derivatives(rows: Rows) -> Tensor:
+    """The mean log-area by torchfsid: compiled clips and implicit differentiation."""
     theta = FeasibleSet.from_box(*corners(len(rows[0])))
     for A, b in zip(rows[::2], rows[1::2], strict=True):
         theta = theta.intersect(Halfspaces(A, b))
@@ -56,6 +57,7 @@ def by_implicit_derivatives(rows: Rows) -> Tensor:
 
 
 def by_torch_clips(rows: Rows) -> Tensor:
+    """The mean log-area by clips in torch, the reference of the tests."""
     rings = Rings.boxes(*corners(len(rows[0])))
     for A, b in zip(rows[::2], rows[1::2], strict=True):
         rings = rings.clip(A, b)
@@ -114,11 +116,13 @@ def compared(
 
 
 def clips(repeats: int) -> list[dict[str, Any]]:
+    """The measurements of `clips`, one entry per batch size."""
     ways = {"implicit": by_implicit_derivatives, "torch": by_torch_clips}
     return [compared("clips", batch, ways, workload(batch), repeats) for batch in BATCHES]
 
 
 def probe(repeats: int) -> list[dict[str, Any]]:
+    """The measurements of `probe`."""
     config = load(Path("configs/probe_placement.yaml"), [], "design")
     probing, found = Probing.of(config), []
     goals = probing.draw_goals(config.goals.train, 1)

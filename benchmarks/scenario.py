@@ -76,13 +76,16 @@ class Fleet:
             x, step = x + STEP * u, step + 1
 
     def prior(self) -> FeasibleSet:
+        """The prior sets of all robots."""
         corner = torch.full_like(self.goals, self.half + 1)
         return FeasibleSet.from_box(-corner, corner)
 
 
 def observer(prior: FeasibleSet, compiled: bool) -> SetMembershipObserver:
+    """The observer of the sets, compiled or in torch."""
     return SetMembershipObserver(TASK, [BARRIER], prior, noise=NoiseBound(ERROR), compiled=compiled)
 
 
 def measured(t: float, x: Tensor, u: Tensor, robots: range | None = None, neighbours: int = NEIGHBOURS) -> Measurement:
+    """The measurement of these robots among their nearest neighbours."""
     return nearest_bodies(t, x, u, count=neighbours, robots=robots)

@@ -242,6 +242,11 @@ class Appender:
         self.file.close()
 
     def append(self, piece: str) -> None:
+        """Append a piece, whole or not at all.
+
+        Raises:
+            OSError: it cannot be written. The file is then as it was before.
+        """
         left, whole = piece.encode(), self.file.seek(0, os.SEEK_END)
         try:
             with named(self.path):
@@ -258,6 +263,7 @@ class RowWriter(Appender):
     header: list[str] | None = None
 
     def write(self, rows: Iterable[dict[str, Any]]) -> None:
+        """Append table rows."""
         rows, text = list(rows), io.StringIO(newline="")
         if not rows:
             return

@@ -81,6 +81,7 @@ class ConstantGain(nn.Module):
         self.kp = kp
 
     def forward(self, step: Step, information: Tensor) -> Update:
+        """The gain for this sample. The information matrix is passed on unchanged."""
         identity = torch.eye(2, dtype=torch.float64).expand_as(information)
         return Update(self.log_share.exp() / self.kp**2 * identity, information)
 
@@ -93,6 +94,7 @@ class RlsGain(nn.Module):
         self.pull = pull
 
     def forward(self, step: Step, information: Tensor) -> Update:
+        """The gain for this sample, from the information before it."""
         R = step.noise**2 / 4
         information = information + step.G.mT @ step.G / R
         pull = None if self.pull is None else torch.full_like(step.area, self.pull)
@@ -132,6 +134,7 @@ class NetworkGain(nn.Module):
             self.outer.bias.copy_(torch.tensor(UNTRAINED))
 
     def answer(self, area: Tensor, case: Tensor, noise: float) -> Answer:
+        """Distrust, memory and pull for areas [m^2], cases and a noise bound [m/s]."""
         level = torch.full_like(area, math.log(noise / self.speed) / 5)
         sizes = torch.stack([(area / self.prior_area).log() / 10, level], dim=-1)
         cases = nn.functional.one_hot(case, len(CASES)).to(torch.float64)
@@ -139,6 +142,7 @@ class NetworkGain(nn.Module):
         return Answer(distrust.exp(), memory.sigmoid(), pull.sigmoid())
 
     def forward(self, step: Step, information: Tensor) -> Update:
+        """The gain for this sample, from the information before it."""
         distrust, memory, pull = self.answer(step.area, step.case, step.noise)
         R = (distrust * step.noise**2 / 4)[:, None, None]
         information = memory[:, None, None] * information + step.G.mT @ step.G / R

@@ -60,10 +60,12 @@ class DesignConfig(Strict):
 
     @property
     def steps(self) -> int:
+        """The number of samples of a run."""
         return round(self.duration / self.dt)
 
     @property
     def safety_distance(self) -> float:
+        """The safety distance of the barrier [m]."""
         assert self.avoidance.safety_distance is not None
         return self.avoidance.safety_distance
 

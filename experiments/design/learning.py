@@ -193,5 +193,6 @@ def _paired(difference: np.ndarray) -> dict[str, float]:
 
 
 def print_learning(summary: dict[str, Any], console: Console) -> None:
+    """Print the summary."""
     for noise, observers in summary["mean errors by noise [m]"].items():
         print_rows(console, f"Mean error in m on unseen teams, disturbance up to {noise} m/s", "observer", observers)

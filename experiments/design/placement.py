@@ -217,6 +217,7 @@ def summarise(runs: list[dict[str, Any]], checks: list[dict[str, Any]]) -> dict[
 
 
 def print_placement(summary: dict[str, Any], console: Console) -> None:
+    """Print the summary."""
     for K, methods in summary["areas [m^2]"].items():
         still = "a probe that stands still" if K == "1" else f"a path of {K} way-points"
         print_rows(console, f"Mean area left, {still}, {summary['corridors']} corridors", "method", methods)

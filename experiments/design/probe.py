@@ -90,14 +90,17 @@ class Probing:
 
     @property
     def prior(self) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
+        """Lower and upper corner of Theta_0 [m]."""
         return _box(self.config.prior)
 
     @property
     def room(self) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
+        """Lower and upper corner of the room for way-points [m]."""
         return _box(self.config.room)
 
     @property
     def prior_area(self) -> float:
+        """The area A_0 of Theta_0 [m^2]."""
         lower, upper = self.prior
         return float((upper - lower).prod())
 
@@ -122,6 +125,7 @@ class Probing:
 
     @property
     def controller(self) -> CbfQpController:
+        """The robot's controller."""
         return CbfQpController(GoalTask(self.config.gain), [self.config.avoidance.build([])])
 
     @property

@@ -49,6 +49,7 @@ class Evaluated:
     starts: list[Int[Tensor, "P"]] = field(default_factory=list)
 
     def add(self, placements: Float[Tensor, "P K 2"], areas: Float[Tensor, "P S"]) -> Float[Tensor, "P"]:
+        """Append a batch with its areas, and return the mean areas over goals [m^2]."""
         self.placements.append(placements.detach().clone())
         self.means.append(areas.detach().mean(-1))
         return self.means[-1]
@@ -74,6 +75,7 @@ class Search:
 
     @classmethod
     def of(cls, probing: Probing, goals: Float[Tensor, "S 2"], way_points: int, seed: np.random.SeedSequence) -> Search:
+        """A search with the predicted path for these goals, and random numbers from `seed`."""
         return cls(probing, goals, predicted_path(probing, goals), way_points, np.random.default_rng(seed))
 
     def anywhere(self, count: int) -> Float[Tensor, "P K 2"]:
@@ -105,6 +107,7 @@ class Search:
         return self.probing.allowed(self.path[at] + ring)
 
     def evaluate(self, placements: Float[Tensor, "P K 2"]) -> Float[Tensor, "P S"]:
+        """The area for every placement and goal [m^2], without gradients."""
         with torch.no_grad():
             return self.probing.left(placements, self.goals).area
 
@@ -116,6 +119,8 @@ def predicted_path(probing: Probing, goals: Float[Tensor, "S 2"]) -> Float[Tenso
 
 
 def drawn(draw: Callable[[Search, int], Tensor]) -> Callable[[Search], Evaluated]:
+    """The method that evaluates placements drawn by `draw`, all in all `starts` x `steps`."""
+
     def method(search: Search) -> Evaluated:
         found, settings = Evaluated(), search.probing.config.search
         for _ in range(settings.steps):

@@ -43,6 +43,7 @@ def padded(lower: np.ndarray, upper: np.ndarray, aspect: float, margin: float) -
 
 
 def frame(axes: Axes, box: tuple[np.ndarray, np.ndarray]) -> None:
+    """Limit the axes to the box [m]."""
     (left, bottom), (right, top) = box
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
 
@@ -68,6 +69,7 @@ def darken(axes: Axes, discs: Sequence[Circle], config: SceneConfig, active: Seq
 
 
 def add_robot(axes: Axes, at: Sequence[float], radius: float, colour: str, *, solid: bool = True) -> Circle:
+    """Draw a robot as a disc."""
     face, edge = (colour, "white") if solid else (translucent(colour, 0.45), colour)
     disc = Circle((at[0], at[1]), radius, facecolor=face, edgecolor=edge, lw=0.7, zorder=5)
     axes.add_patch(disc)
@@ -75,6 +77,7 @@ def add_robot(axes: Axes, at: Sequence[float], radius: float, colour: str, *, so
 
 
 def add_region(axes: Axes, vertices: np.ndarray, colour: str, *, filled: bool, zorder: float = 1) -> Polygon:
+    """Draw a set as a polygon."""
     face = translucent(colour, 0.25) if filled else "none"
     region = Polygon(vertices, facecolor=face, edgecolor=colour, lw=1.1, zorder=zorder, joinstyle="round")
     axes.add_patch(region)
@@ -82,9 +85,11 @@ def add_region(axes: Axes, vertices: np.ndarray, colour: str, *, filled: bool, z
 
 
 def add_goal(axes: Axes, at: Sequence[float], colour: str = "black", size: float = 9) -> None:
+    """Mark a goal."""
     axes.plot(at[0], at[1], "*", color=colour, ms=size, mec="white", mew=0.6, zorder=7)
 
 
 def translucent(colour: str, opacity: float) -> tuple[float, float, float, float]:
+    """The colour with this opacity, as (red, green, blue, opacity)."""
     red, green, blue = to_rgb(colour)
     return red, green, blue, opacity

@@ -126,6 +126,7 @@ class ExperimentConfig(Strict):
 
     @property
     def steps(self) -> int:
+        """The number of samples of the run."""
         return round(self.duration / self.dt)
 
     @property
@@ -183,6 +184,7 @@ class SceneConfig(ExperimentConfig):
 
     @property
     def bodies(self) -> list[str]:
+        """The names of the robots, then of the obstacles."""
         return [body.name for body in (*self.robots, *self.obstacles)]
 
     @model_validator(mode="after")

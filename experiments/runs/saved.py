@@ -48,6 +48,7 @@ class Results:
 
     @cached_property
     def robots(self) -> list[str]:
+        """The names of the robots, or of the cases."""
         named = self.config.cases if isinstance(self.config, CasesConfig) else self.config.robots
         return [robot.name for robot in named]
 
@@ -110,6 +111,7 @@ class Results:
 
     @cached_property
     def summary(self) -> dict[str, Any]:
+        """The content of summary.json."""
         return read_json(self.folder / "summary.json")
 
     @cached_property

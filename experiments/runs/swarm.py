@@ -128,5 +128,6 @@ def _rounded(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def print_swarm(summary: dict[str, Any], console: Console) -> None:
+    """Print the summary."""
     for name, value in summary.items():
         console.print(f"{name.replace('_', ' ')}: {value}", highlight=False)

@@ -61,6 +61,7 @@ class Belief:
 
 
 def without_last_pillar(samples: list[Measurement]) -> list[Measurement]:
+    """The measurements without the last pillar."""
     visible = torch.arange(ROBOTS + len(PILLARS)) < ROBOTS + len(PILLARS) - 1
     return [replace(sample, present=sample.present & visible) for sample in samples]
 
@@ -153,6 +154,7 @@ def measured(runs: Sequence[Trajectory], error: float) -> list[Measurement]:
 
 
 def joined(teams: Sequence[Measurement]) -> Measurement:
+    """The measurements of several teams as one batch."""
     columns: dict[str, Any] = {}
     for field in fields(Measurement):
         values = [getattr(team, field.name) for team in teams]
@@ -187,6 +189,7 @@ def ending(belief: Belief, samples: list[Measurement], goals: Tensor, noise: Noi
 
 
 def prior(goals: Tensor) -> FeasibleSet:
+    """The prior set of each robot."""
     reach = torch.full_like(goals, 6.0)
     return FeasibleSet.from_box(-reach, reach)
 
@@ -203,6 +206,7 @@ def automatic(belief: Belief, samples: list[Measurement], goals: Tensor, neighbo
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the study and print the table."""
     parser = argparse.ArgumentParser(prog="python -m experiments.studies.wrong_models")
     parser.add_argument("--seeds", type=int, default=12, help="runs per model and bound")
     parser.add_argument("--auto", action="store_true", help="take the bound that velocity: auto would")

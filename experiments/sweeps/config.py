@@ -59,6 +59,7 @@ class SweepConfig(Strict):
 
     @property
     def runs(self) -> int:
+        """The number of runs."""
         return len(self.points) * self.repeats
 
     @cached_property
@@ -72,6 +73,7 @@ class SweepConfig(Strict):
         return [dict(ChainMap(*reversed(levels))) for levels in itertools.product(*self.axes)]
 
     def point(self, run: int) -> dict[str, Any]:
+        """The point of the grid of a run."""
         return self.points[run // self.repeats]
 
     def scene(self, run: int) -> SceneConfig:

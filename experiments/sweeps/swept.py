@@ -31,6 +31,7 @@ class Swept:
 
     @cached_property
     def all_runs(self) -> Columns:
+        """All finished runs, the failed ones included."""
         return read_table(self.folder / "runs.parquet")
 
     @cached_property
@@ -47,10 +48,12 @@ class Swept:
 
     @cached_property
     def failed(self) -> int:
+        """The number of failed runs."""
         return len(self.all_runs["run"]) - len(self.runs["run"])
 
     @cached_property
     def series(self) -> Columns:
+        """Sizes and errors over time."""
         return read_table(self.folder / "series.parquet")
 
     @cached_property

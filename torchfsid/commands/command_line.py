@@ -29,6 +29,7 @@ class Parser(argparse.ArgumentParser):
     """A parser that reports a mistake in one line."""
 
     def error(self, message: str) -> NoReturn:
+        """Print the mistake in one line, and exit with code 2."""
         self.exit(USAGE_ERROR, f"{self.prog}: {message}\n")
 
 

@@ -84,6 +84,7 @@ class Observation:
 
     @property
     def config(self) -> ObserveConfig:
+        """The configuration of the declared model."""
         return self.declared.config
 
     @property

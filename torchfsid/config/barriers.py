@@ -33,6 +33,7 @@ class ClassKConfig(Strict):
     power: Positive = 1.0
 
     def build(self) -> ClassK:
+        """The `ClassK` with these values."""
         from torchfsid.robots.barriers import ClassK
 
         return ClassK(self.gain, self.power)
@@ -129,6 +130,7 @@ class SpeedBoxConfig(_RobotsOwn):
     soft: Flag = False
 
     def build(self, bodies: Sequence[str]) -> Barrier:
+        """The barrier. It does not depend on the bodies."""
         from torchfsid.robots.barriers import SpeedBox
 
         return SpeedBox(self.limit, self.soft)
@@ -143,6 +145,7 @@ class SpeedPolygonConfig(_RobotsOwn):
     soft: Flag = False
 
     def build(self, bodies: Sequence[str]) -> Barrier:
+        """The barrier. It does not depend on the bodies."""
         from torchfsid.robots.barriers import SpeedPolygon
 
         return SpeedPolygon(self.sides, self.limit, self.soft)
@@ -164,6 +167,7 @@ class ArenaConfig(_RobotsOwn):
         return self
 
     def build(self, bodies: Sequence[str]) -> Barrier:
+        """The barrier. It does not depend on the bodies."""
         from torchfsid.robots.barriers import Arena
 
         return Arena(self.lower, self.upper, self.class_k.build(), self.margin, self.soft)

@@ -87,6 +87,7 @@ class GoalConfig(_Task):
         return (limit[0], limit[1]) if isinstance(limit, tuple) else (limit, limit)
 
     def build(self, bodies: Sequence[str]) -> Task:
+        """The `GoalTask` with these values."""
         from torchfsid.robots.tasks import GoalTask, Saturation
 
         if not self.is_clipped:
@@ -105,6 +106,7 @@ class UnknownGainGoalConfig(_Task):
         return 3
 
     def build(self, bodies: Sequence[str]) -> Task:
+        """The `UnknownGainGoalTask`."""
         from torchfsid.robots.tasks import UnknownGainGoalTask
 
         return UnknownGainGoalTask()
@@ -116,6 +118,7 @@ class VelocityConfig(_Task):
     kind: Literal["velocity"] = "velocity"
 
     def build(self, bodies: Sequence[str]) -> Task:
+        """The `VelocityTask`."""
         from torchfsid.robots.tasks import VelocityTask
 
         return VelocityTask()
@@ -133,6 +136,11 @@ class FormationConfig(_Task):
         return (self.leader,)
 
     def build(self, bodies: Sequence[str]) -> Task:
+        """The `FormationTask` among these bodies.
+
+        Raises:
+            ConfigError: `leader` is not among them.
+        """
         from torchfsid.robots.tasks import FormationTask
 
         require_body("task.leader", self.leader, bodies)
@@ -146,6 +154,7 @@ class OrbitConfig(_Task):
     rate: Number
 
     def build(self, bodies: Sequence[str]) -> Task:
+        """The `OrbitTask` with these values."""
         from torchfsid.robots.tasks import OrbitTask
 
         return OrbitTask(self.rate)
@@ -170,6 +179,7 @@ class PatrolConfig(_Task):
         return 2 + 4 * self.harmonics
 
     def build(self, bodies: Sequence[str]) -> Task:
+        """The `PatrolTask` with these values."""
         from torchfsid.robots.tasks import PatrolTask
 
         return PatrolTask(self.gain, self.rate, self.harmonics)
