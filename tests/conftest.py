@@ -1,5 +1,6 @@
 """What every test shares."""
 
+import signal
 from collections.abc import Iterator
 
 import jaxtyping
@@ -9,6 +10,9 @@ from matplotlib.figure import Figure
 
 # On tensors this small torch is many times slower with more threads. They are no part of what is tested.
 torch.set_num_threads(1)
+
+# A shell's background job ignores SIGINT and hands this down: the commands under test would ignore it, too.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture

@@ -232,3 +232,10 @@ def test_a_narrow_terminal_shows_every_digit() -> None:
     assert "…" not in text
     for number in ("3.53e-05", "0.0068", "448262.1235", "5411932.123", "0.00333"):
         assert number in text
+
+
+@pytest.mark.parametrize("stream", ["stdout", "stderr"])
+def test_a_closed_stream_is_nowhere(monkeypatch: pytest.MonkeyPatch, stream: str) -> None:
+    """`program >&-`: Python then has no stream at all."""
+    monkeypatch.setattr(sys, stream, None)
+    assert execute("prog", lambda: print("x")) == 0

@@ -54,15 +54,13 @@ def test_a_fresh_run_removes_what_an_earlier_one_wrote_and_nothing_else(tmp_path
     assert not (out / "goal").exists()
 
 
-def test_files_of_the_same_names_are_replaced_without_a_list_of_them(tmp_path: Path) -> None:
-    """A folder that was written before there were lists."""
-    write_whole(tmp_path / "config.yaml", CONFIG)
-    write_whole(tmp_path / "regions.json", "old")
-    new = folder(tmp_path)
-    new.claim(["regions.json"], "task: {kind: goal, gain: 1}\n")
-    new.release()
-    assert contents(tmp_path) == {"config.yaml"}
-    assert (tmp_path / "config.yaml").read_text() == "task: {kind: goal, gain: 1}\n"
+@pytest.mark.parametrize("name", ["config.yaml", "regions.json"])
+def test_a_file_that_no_run_left_is_never_replaced(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text(CONFIG)
+    with pytest.raises(ConfigError, match=f"{name} is there, and no run left it"):
+        folder(tmp_path).claim(["regions.json"], CONFIG)
+    assert (tmp_path / name).read_text() == CONFIG
+    assert os.listdir(tmp_path) == [name]
 
 
 def test_a_list_cannot_lead_out_of_the_folder(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ moment, one clear line on stderr, and exit code 2.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -64,3 +65,7 @@ def _check(log: Path, config: Path, folder: ResultsFolder | None, overrides: Seq
         from torchfsid.commands.on_logs import check_log
 
     check_log(log, models, folder)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

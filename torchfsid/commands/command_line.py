@@ -59,6 +59,9 @@ def execute(
         return folder is not None and folder.claimed
 
     code, message = DONE, ""
+    for name in ("stdout", "stderr"):  # None where the shell has closed it
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
     # The message is printed below the `except` clauses. By then the frames of the exception are gone, and with them a
     # progress line.
     try:

@@ -2,7 +2,8 @@
 
 A folder belongs to the kind of command whose config.yaml it holds: `observe`, or the `kind` of an experiment. The file
 `.torchfsid` lists the names of the files written there, one a line. The next run of the same kind removes exactly these
-files. `.torchfsid` is locked while a command writes.
+files. If a file that is to be written exists and is not listed, it is somebody else's, and the folder is refused.
+`.torchfsid` is locked while a command writes.
 """
 
 from __future__ import annotations
@@ -70,29 +71,34 @@ class ResultsFolder:
             resume: keep what is there, if its config.yaml is the same.
 
         Raises:
-            ConfigError: see `require_ours`. Also if another command is writing there, or `resume` finds another
-                config.yaml.
+            ConfigError: see `require_ours`. Also if another command is writing there, if a file that would be replaced
+                was not written by a run, or if `resume` finds another config.yaml.
             OSError: the folder cannot be made or written to.
         """
         self.require_ours()
         self.path.mkdir(parents=True, exist_ok=True)
-        lock = (self.path / MANIFEST).open("a+b")
+        manifest, names = self.path / MANIFEST, [*(["config.yaml"] if config is not None else []), *files]
+        is_new = not manifest.exists()
+        lock = manifest.open("a+b")
         try:
             _lock(lock, self.path)
             self.require_ours()
             if resume and config is not None and _text(self.path / "config.yaml") not in (None, config):
                 raise ConfigError(f"{self.path}: holds another {self.kind}; choose another --out, or remove it")
+            lock.seek(0)
+            listed = lock.read().decode(errors="replace").splitlines()
+            foreign = [name for name in names if name not in listed and (self.path / name).exists()]
+            if foreign and not resume:
+                raise ConfigError(f"{self.path}: {foreign[0]} is there, and no run left it; choose another --out")
         except BaseException:
             lock.close()
+            if is_new:
+                manifest.unlink(missing_ok=True)
             raise
         self._lock = lock
-        lock.seek(0)
-        listed = lock.read().decode(errors="replace").splitlines()
-        names = [*(["config.yaml"] if config is not None else []), *files]
         if not resume:
-            mine = (
-                names if self.kind is None else [*listed, *names]
-            )  # a command that adds to a folder replaces its own files only
+            # A command that adds to a folder replaces its own files only.
+            mine = names if self.kind is None else [*listed, *names]
             for name in dict.fromkeys(mine):
                 self._remove(name)
             listed = [name for name in listed if name not in mine]
