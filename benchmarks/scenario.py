@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchfsid.observers.set_membership import SetMembershipObserver
-from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.neighbours import nearest_bodies

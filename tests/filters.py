@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchfsid.observers.ukf import ParameterUkf
-from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.simulation import Trajectory, simulate

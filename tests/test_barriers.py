@@ -21,7 +21,8 @@ from torchfsid import (
 from torchfsid.config.barriers import AvoidanceConfig, ClassKConfig
 from torchfsid.errors import ConfigError, InputError
 from torchfsid.robots.affine_barrier import AffineBarrier
-from torchfsid.robots.barriers import Arena, ClassK, SpeedPolygon
+from torchfsid.robots.avoidance import ClassK
+from torchfsid.robots.barriers import Arena, SpeedPolygon
 from torchfsid.robots.measurement import Measurement
 
 AT_REST = Measurement.of_team(0.0, torch.zeros(1, 2), torch.zeros(1, 2))

@@ -19,7 +19,7 @@ from torchfsid.logs.log import read_csv
 from torchfsid.observers.consistency import RESOLUTION, SMALLEST
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.outcome import Status
-from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.simulation import Trajectory, simulate

@@ -9,7 +9,7 @@ import torch
 import yaml
 
 from torchfsid.cli import main
-from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.simulation import simulate
 from torchfsid.robots.tasks import GoalTask

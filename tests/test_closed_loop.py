@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchfsid.errors import InputError
-from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.simulation import closed_loop, simulate

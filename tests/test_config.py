@@ -18,7 +18,8 @@ from torchfsid.config.tasks import TaskConfig
 from torchfsid.errors import ConfigError
 from torchfsid.observers.hybrid import HybridObserver
 from torchfsid.observers.set_membership import SetMembershipObserver
-from torchfsid.robots.barriers import Arena, ClassK, CollisionAvoidance, SpeedBox, SpeedPolygon
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
+from torchfsid.robots.barriers import Arena, SpeedBox, SpeedPolygon
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.tasks import FormationTask, GoalTask, OrbitTask, PatrolTask, UnknownGainGoalTask, VelocityTask
 from torchfsid.tolerances import ACTIVE_TOLERANCE

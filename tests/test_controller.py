@@ -9,7 +9,8 @@ import torch
 
 from torchfsid.errors import InputError
 from torchfsid.identification.kkt import solve_kkt
-from torchfsid.robots.barriers import ClassK, CollisionAvoidance, SpeedBox, stack_barriers
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
+from torchfsid.robots.barriers import SpeedBox, stack_barriers
 from torchfsid.robots.controller import CbfQpController, solve_safe_qp
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.tasks import GoalTask

@@ -10,7 +10,8 @@ from torch import Tensor
 
 import torchfsid as fsid
 from tests.devices import ElsewhereMode
-from torchfsid.robots.barriers import Arena, Barrier, ClassK, SpeedBox, SpeedPolygon
+from torchfsid.robots.avoidance import ClassK
+from torchfsid.robots.barriers import Arena, Barrier, SpeedBox, SpeedPolygon
 from torchfsid.robots.tasks import Saturation
 
 GOALS = torch.tensor([[2.0, 0.1], [-2.0, 0.0], [0.1, -1.5]], dtype=torch.float64)

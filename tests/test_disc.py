@@ -14,7 +14,7 @@ from torchfsid.halfspaces import Halfspaces
 from torchfsid.kernels import disc
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.outcome import Outcome
-from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.tasks import GoalTask

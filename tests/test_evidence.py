@@ -17,7 +17,8 @@ from torchfsid.identification import evidence as room
 from torchfsid.identification.evidence import ObservationModel, evidence
 from torchfsid.identification.kkt import solve_kkt
 from torchfsid.observers.set_membership import SetMembershipObserver
-from torchfsid.robots.barriers import ClassK, CollisionAvoidance, SpeedBox
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
+from torchfsid.robots.barriers import SpeedBox
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement

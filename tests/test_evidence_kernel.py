@@ -18,7 +18,8 @@ from torchfsid.halfspaces import Halfspaces
 from torchfsid.identification.evidence import Evidence, ObservationModel, evidence
 from torchfsid.observers.set_membership import Event, SetMembershipObserver
 from torchfsid.robots.affine_barrier import AffineBarrier
-from torchfsid.robots.barriers import ClassK, CollisionAvoidance, SpeedPolygon
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
+from torchfsid.robots.barriers import SpeedPolygon
 from torchfsid.robots.bounds import NoiseBound, RowErrors
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.tasks import AffineTask, GoalTask, Saturation

@@ -16,7 +16,8 @@ from torch import Tensor
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.outcome import Outcome
-from torchfsid.robots.barriers import ClassK, CollisionAvoidance, SpeedBox
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
+from torchfsid.robots.barriers import SpeedBox
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement

@@ -8,7 +8,7 @@ import torch
 
 from benchmarks import fleet, geometry, observer, scenario
 from tests.problems import exact_area, exact_box, exact_intersection, solve_qp
-from torchfsid.robots.barriers import CollisionAvoidance
+from torchfsid.robots.avoidance import CollisionAvoidance
 from torchfsid.sets.feasible_set import MAX_FACETS
 
 

@@ -9,7 +9,7 @@ import torch
 
 from tests.logs import bounded_errors, write_log
 from torchfsid.cli import main
-from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.simulation import Trajectory, simulate
 from torchfsid.robots.tasks import GoalTask

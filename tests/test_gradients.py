@@ -20,7 +20,7 @@ from tests.reference_clip import Rings
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.identification.critical_region import critical_region
 from torchfsid.identification.inverse_optimal import inverse_optimal_set
-from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.tasks import GoalTask

@@ -15,7 +15,7 @@ from torchfsid.halfspaces import Halfspaces
 from torchfsid.observers.hybrid import CONDITION, HybridObserver
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.observers.ukf import ParameterUkf, UkfEstimate
-from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement

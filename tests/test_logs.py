@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from torchfsid.errors import LogError
 from torchfsid.logs.log import Log, read_csv
-from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 
 IRSIM = """t,robot,x,y,vx,vy,radius
 0,0,1,5.1,0.72,-0.009,0.2

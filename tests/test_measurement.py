@@ -13,7 +13,8 @@ from torch import Tensor
 from torchfsid.errors import InputError
 from torchfsid.identification.evidence import ObservationModel, evidence
 from torchfsid.observers.set_membership import SetMembershipObserver
-from torchfsid.robots.barriers import Arena, Barrier, ClassK, CollisionAvoidance, SpeedBox
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
+from torchfsid.robots.barriers import Arena, Barrier, SpeedBox
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchfsid.errors import InputError
 from torchfsid.observers.set_membership import SetMembershipObserver
-from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement

@@ -18,7 +18,7 @@ from torchfsid.cli import main
 from torchfsid.commands import results
 from torchfsid.commands.results_folder import ResultsFolder
 from torchfsid.observers.set_membership import SetEstimate, SetMembershipObserver
-from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.simulation import simulate

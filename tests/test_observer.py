@@ -8,7 +8,8 @@ import torch
 from torchfsid.errors import InputError
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.outcome import Status
-from torchfsid.robots.barriers import ClassK, CollisionAvoidance, SpeedBox
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
+from torchfsid.robots.barriers import SpeedBox
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement

@@ -13,7 +13,7 @@ from torch.autograd import gradcheck, gradgradcheck
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.observers.set_membership import SetKind, SetMembershipObserver
 from torchfsid.outcome import Status
-from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.simulation import simulate

@@ -10,7 +10,8 @@ import torch
 from torchfsid.identification.evidence import ObservationModel, evidence
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.outcome import Status
-from torchfsid.robots.barriers import Arena, Barrier, ClassK, CollisionAvoidance, SpeedPolygon
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
+from torchfsid.robots.barriers import Arena, Barrier, SpeedPolygon
 from torchfsid.robots.bounds import ErrorBounds, NoiseBound
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement

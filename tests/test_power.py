@@ -7,7 +7,8 @@ import torch
 
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.outcome import Status
-from torchfsid.robots.barriers import Barrier, ClassK, CollisionAvoidance, SpeedPolygon
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
+from torchfsid.robots.barriers import Barrier, SpeedPolygon
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement

@@ -20,7 +20,7 @@ from torchfsid.logs.log import Log
 from torchfsid.logs.read import read_log
 from torchfsid.logs.resampling import Track, log_of_tracks, seconds
 from torchfsid.observers.set_membership import SetMembershipObserver
-from torchfsid.robots.barriers import ClassK, CollisionAvoidance
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.simulation import Trajectory, simulate
 from torchfsid.robots.tasks import GoalTask

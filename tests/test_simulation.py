@@ -8,7 +8,8 @@ import torch
 
 from torchfsid.errors import InputError
 from torchfsid.identification.active_set import active_set
-from torchfsid.robots.barriers import ClassK, CollisionAvoidance, SpeedBox, stack_barriers
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
+from torchfsid.robots.barriers import SpeedBox, stack_barriers
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.simulation import STILL, simulate
 from torchfsid.robots.tasks import GoalTask

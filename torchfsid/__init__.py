@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from torchfsid.programmes.layers import ChebyshevCentre as ChebyshevCentre
     from torchfsid.programmes.layers import ProjectOnto as ProjectOnto
     from torchfsid.robots.affine_barrier import AffineBarrier as AffineBarrier
+    from torchfsid.robots.avoidance import ClassK as ClassK
+    from torchfsid.robots.avoidance import CollisionAvoidance as CollisionAvoidance
     from torchfsid.robots.barriers import Arena as Arena
-    from torchfsid.robots.barriers import ClassK as ClassK
-    from torchfsid.robots.barriers import CollisionAvoidance as CollisionAvoidance
     from torchfsid.robots.barriers import SpeedBox as SpeedBox
     from torchfsid.robots.barriers import SpeedPolygon as SpeedPolygon
     from torchfsid.robots.bounds import NoiseBound as NoiseBound
@@ -52,7 +52,8 @@ _HOME = {
     "observers.ukf": ["ParameterUkf"],
     "programmes.layers": ["ChebyshevCentre", "ProjectOnto"],
     "robots.affine_barrier": ["AffineBarrier"],
-    "robots.barriers": ["Arena", "ClassK", "CollisionAvoidance", "SpeedBox", "SpeedPolygon"],
+    "robots.avoidance": ["ClassK", "CollisionAvoidance"],
+    "robots.barriers": ["Arena", "SpeedBox", "SpeedPolygon"],
     "robots.bounds": ["NoiseBound"],
     "robots.controller": ["CbfQpController"],
     "robots.measurement": ["Measurement"],

@@ -21,7 +21,8 @@ from torchfsid.commands.declared_log import AUTO_FACTOR
 from torchfsid.observers.consistency import Consistency
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.outcome import Status
-from torchfsid.robots.barriers import Barrier, ClassK, CollisionAvoidance
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
+from torchfsid.robots.barriers import Barrier
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement

@@ -1,4 +1,4 @@
-"""The barriers in configuration files. Each builds an object of `robots.barriers`.
+"""The barriers in configuration files. Each builds an object of `robots.avoidance` or `robots.barriers`.
 
 Each barrier says what it needs from a log: the bodies' radii, and their velocities now or one sample earlier.
 """
@@ -23,7 +23,8 @@ from torchfsid.config.quantities import (
 from torchfsid.errors import ConfigError
 
 if TYPE_CHECKING:
-    from torchfsid.robots.barriers import Barrier, ClassK
+    from torchfsid.robots.avoidance import ClassK
+    from torchfsid.robots.barriers import Barrier
 
 
 class ClassKConfig(Strict):
@@ -34,7 +35,7 @@ class ClassKConfig(Strict):
 
     def build(self) -> ClassK:
         """The `ClassK` with these values."""
-        from torchfsid.robots.barriers import ClassK
+        from torchfsid.robots.avoidance import ClassK
 
         return ClassK(self.gain, self.power)
 
@@ -43,7 +44,7 @@ class AvoidanceConfig(Strict):
     """`CollisionAvoidance`, by `safety_distance`, or by `margin` if the log has radii. Exactly one of the two is given.
 
     Attributes:
-        distance: form of h, see `robots.barriers`.
+        distance: form of h, see `robots.avoidance`.
         safety_distance: distance between centres [m].
         safety_distances: distances to single bodies that replace `safety_distance` [m].
         margin: distance between the discs of two bodies [m].
@@ -95,7 +96,7 @@ class AvoidanceConfig(Strict):
         """
         import torch
 
-        from torchfsid.robots.barriers import CollisionAvoidance
+        from torchfsid.robots.avoidance import CollisionAvoidance
 
         for name in self.safety_distances:
             require_body(f"safety_distances.{name}", name, bodies)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.robots.barriers import NeighbourVelocity
+from torchfsid.robots.avoidance import NeighbourVelocity
 from torchfsid.robots.bounds import ErrorBounds, RowErrors
 from torchfsid.robots.measurement import Measurement
 

@@ -1,0 +1,171 @@
+r"""Avoidance of other bodies: one row A u <= b for each (G., Eq. (6), in the units of control barrier functions).
+
+With dx = x - x_j and h >= 0 the safe side:
+
+    squared    h = |dx|^2 - Ds^2     -2 dx.u        <= alpha(h)  [- 2 dx.u_j]
+    euclidean  h = |dx| - Ds         -(dx/|dx|).u   <= alpha(h)  [- (dx/|dx|).u_j]
+
+The bracket is the neighbour's share. It is absent (`none`, the paper), or uses the neighbour's velocity now (`current`:
+one joint QP over the team) or one sample ago (`previous`). The paper's row, a = -dx, b = gamma/2 h, is half the row of
+`squared` with alpha(h) = gamma h. It is the same half-space, and nothing here depends on the scale of a row.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchfsid.errors import InputError
+from torchfsid.halfspaces import Halfspaces, dot
+from torchfsid.robots.bounds import ErrorBounds, RowErrors
+from torchfsid.robots.measurement import Measurement
+from torchfsid.tolerances import ROUND_OFF
+
+NeighbourVelocity = Literal["none", "current", "previous"]
+
+
+@dataclass(frozen=True)
+class ClassK:
+    """alpha(h) = gain sign(h) |h|^power, an extended class-K function."""
+
+    gain: float | Tensor
+    power: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (bool(torch.as_tensor(self.gain) > 0) and self.power > 0):
+            raise InputError("class_k", "gain > 0 and power > 0", (self.gain, self.power))
+
+    def __call__(self, h: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+        return self.gain * (h if self.power == 1 else h.sign() * h.abs() ** self.power)
+
+
+@dataclass(frozen=True)
+class CollisionAvoidance:
+    """One row per body: keep the distance `safety_distance`, or radius_i + radius_j + `margin`, both in [m].
+
+    `safety_distance` may be a tensor (m,), one distance per body.
+
+    Raises:
+        InputError: not exactly one of the two is given. When called: `margin` needs radii, or `neighbour_velocity`
+            needs velocities, that the measurement does not have.
+    """
+
+    class_k: ClassK
+    safety_distance: float | Tensor | None = None
+    margin: float | None = None
+    distance: Literal["squared", "euclidean"] = "squared"
+    neighbour_velocity: NeighbourVelocity = "none"
+    soft: bool = False
+
+    def __post_init__(self) -> None:
+        if (self.safety_distance is None) == (self.margin is None):
+            raise InputError("safety_distance, margin", "exactly one of them", (self.safety_distance, self.margin))
+        if self.safety_distance is not None and not bool((torch.as_tensor(self.safety_distance) > 0).all()):
+            raise InputError("safety_distance", "a positive distance [m]", self.safety_distance)
+
+    def __call__(self, measurement: Measurement) -> Halfspaces:
+        present = measurement.present
+        away = _away(measurement)
+        squared_distance = dot(away, away)
+        Ds = self._safety_distance(measurement.radius, measurement.body_radii)
+        if self.distance == "squared":
+            h, gradient = squared_distance - Ds**2, 2 * away
+        else:  # at the place of a body itself the direction is unknown: the row is NaN
+            apart = squared_distance > 0
+            distance = torch.where(apart, squared_distance, 1.0).sqrt()
+            h = torch.where(apart, distance, 0.0) - Ds
+            gradient = torch.where(apart.unsqueeze(-1), away / distance.unsqueeze(-1), math.nan)
+        b = self.class_k(h)
+        if self.neighbour_velocity != "none":
+            b = b - dot(gradient, self._neighbours(measurement))
+        return Halfspaces(-gradient, b).where(present)
+
+    def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
+        """Bounds on the errors of the rows, with r = |dx| known up to e.
+
+        The direction is wrong by at most asin(e/r), and unknown if e >= r. The boundary phi(r) = alpha(h)/|dh/dx| grows
+        with r and is wrong by at most phi(r) - phi(r - e). Turning the row changes the slack by at most
+        2 sin(angle/2) |u - u_j|.
+
+        Raises:
+            InputError: class_k.power < 1/2 with squared distances: phi would not be monotone.
+        """
+        self._require_monotone("positions have errors")
+        present, away = measurement.present, _away(measurement)
+        e = bounds.position.unsqueeze(-1) + bounds.body_position
+        squared = dot(away, away)
+        clear = squared > e.square()
+        r = torch.where(clear, squared, 1.0).sqrt()
+        e = torch.where(clear, e, 0.0)
+        angle = torch.where(clear, (e / r).clamp(max=1.0).arcsin(), math.pi)
+        motion = torch.zeros_like(away) if measurement.u is None else measurement.u.unsqueeze(-2)
+        velocity_error = torch.zeros_like(r)
+        if self.neighbour_velocity != "none":
+            motion = motion - self._neighbours(measurement)
+            velocity_error = bounds.body_velocity
+        turned = 2 * (angle / 2).sin() * motion.norm(dim=-1)
+        Ds = self._safety_distance(measurement.radius, measurement.body_radii)
+        moved = self._boundary(r, Ds) - self._boundary((r - e).clamp(min=1e-9), Ds)
+        slack = torch.where(clear, moved, math.inf) + turned + velocity_error
+        return RowErrors(torch.where(present, angle, 0.0), torch.where(present, slack, 0.0))
+
+    def slack_left_out(self, measurement: Measurement) -> Float[Tensor, "*batch"]:
+        """phi(R) - |u| - V, the least slack that the row of a body without a slot can have [m/s].
+
+        R is the least distance of these bodies. V is their largest speed, or 0 if the rows do not use it.
+
+        Raises:
+            InputError: class_k.power < 1/2 with squared distances: phi would not be monotone.
+        """
+        self._require_monotone("bodies are left out")
+        left_out, u = measurement.left_out, measurement.u
+        assert left_out is not None
+        assert u is not None
+        Ds = self._safety_distance(measurement.radius, left_out.radius.unsqueeze(-1))
+        largest = Ds.amax(-1) if isinstance(Ds, Tensor) and Ds.ndim > 0 else Ds
+        nearest = torch.where(left_out.distance.isfinite(), left_out.distance, 1.0)
+        phi = self._boundary((nearest * (1 - ROUND_OFF)).clamp(min=1e-9), largest)
+        speed = u.norm(dim=-1)
+        if self.neighbour_velocity != "none":
+            speed = speed + left_out.speed
+        return phi - speed - ROUND_OFF * (phi.abs() + speed)
+
+    def labels(self, bodies: Sequence[str]) -> list[str]:
+        return [f"avoid {body}" for body in bodies]
+
+    def _require_monotone(self, where: str) -> None:
+        if self.distance == "squared" and self.class_k.power < 0.5:
+            raise InputError("class_k.power", f"at least 1/2 where {where}", self.class_k.power)
+
+    def _boundary(self, r: Tensor, Ds: Tensor | float) -> Tensor:
+        """phi(r): the largest speed at which the robot may approach a standing body at distance r [m/s]."""
+        if self.distance == "squared":
+            return self.class_k(r**2 - Ds**2) / (2 * r)
+        return self.class_k(r - Ds)
+
+    def _safety_distance(self, radius: Tensor | None, body_radii: Tensor | None) -> Tensor | float:
+        if self.margin is None:
+            assert self.safety_distance is not None
+            return self.safety_distance
+        if radius is None or body_radii is None:
+            raise InputError("measurement.radius", "radii, since the barrier is given by a margin", None)
+        return radius.unsqueeze(-1) + body_radii + self.margin
+
+    def _neighbours(self, measurement: Measurement) -> Tensor:
+        current = self.neighbour_velocity == "current"
+        velocities = measurement.body_velocities if current else measurement.previous_body_velocities
+        if velocities is None:
+            raise InputError("measurement", f"the {self.neighbour_velocity} velocities of the bodies", None)
+        return velocities
+
+
+def _away(measurement: Measurement) -> Float[Tensor, "*batch m n"]:
+    """x - x_j [m]. Slots without a body get a nonzero vector, so that norms and their gradients are finite."""
+    present, away = measurement.present, measurement.x.unsqueeze(-2) - measurement.bodies
+    return away if bool(present.all()) else torch.where(present.unsqueeze(-1), away, 1.0)
