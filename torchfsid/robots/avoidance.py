@@ -15,10 +15,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchfsid.errors import InputError
@@ -28,6 +28,40 @@ from torchfsid.robots.measurement import Measurement
 from torchfsid.tolerances import ROUND_OFF
 
 NeighbourVelocity = Literal["none", "current", "previous"]
+
+
+class Geometry(NamedTuple):
+    """What the rows are made of.
+
+    Attributes:
+        squared: squared distances r^2 [m^2].
+        r: distances [m].
+        gradient: dh/dx, of length 2 r or 1.
+        share: dh/dx.u_j, the neighbours' shares; 0 if the rows do not use them.
+    """
+
+    squared: Float[Tensor, "*batch m"]
+    r: Float[Tensor, "*batch m"]
+    gradient: Float[Tensor, "*batch m n"]
+    share: Float[Tensor, "*batch m"]
+
+
+class Sight(NamedTuple):
+    """How well bodies are seen, given bounds on the errors of positions.
+
+    Attributes:
+        r: distances [m]; 1 where not `clear`.
+        e: bounds on their errors [m].
+        clear: whether r > e, so that the direction is known.
+        angle: bounds on the errors of the directions [rad].
+        loose: bounds on the change of the slack by turning the row and by the neighbour's velocity error [m/s].
+    """
+
+    r: Float[Tensor, "*batch m"]
+    e: Float[Tensor, "*batch m"]
+    clear: Bool[Tensor, "*batch m"]
+    angle: Float[Tensor, "*batch m"]
+    loose: Float[Tensor, "*batch m"]
 
 
 @dataclass(frozen=True)
@@ -70,50 +104,61 @@ class CollisionAvoidance:
             raise InputError("safety_distance", "a positive distance [m]", self.safety_distance)
 
     def __call__(self, measurement: Measurement) -> Halfspaces:
-        present = measurement.present
-        away = _away(measurement)
-        squared_distance = dot(away, away)
+        seen = self.geometry(measurement)
         Ds = self._safety_distance(measurement.radius, measurement.body_radii)
-        if self.distance == "squared":
-            h, gradient = squared_distance - Ds**2, 2 * away
-        else:  # at the place of a body itself the direction is unknown: the row is NaN
-            apart = squared_distance > 0
-            distance = torch.where(apart, squared_distance, 1.0).sqrt()
-            h = torch.where(apart, distance, 0.0) - Ds
-            gradient = torch.where(apart.unsqueeze(-1), away / distance.unsqueeze(-1), math.nan)
-        b = self.class_k(h)
+        h = seen.squared - Ds**2 if self.distance == "squared" else seen.r - Ds
+        return Halfspaces(-seen.gradient, self.class_k(h) - seen.share).where(measurement.present)
+
+    def geometry(self, measurement: Measurement) -> Geometry:
+        """Distances, gradients of h and the neighbours' shares, which depend on neither gain nor safety distance."""
+        away = _away(measurement)
+        squared = dot(away, away)
+        apart = squared > 0
+        root = torch.where(apart, squared, 1.0).sqrt()
+        gradient = 2 * away
+        if self.distance == "euclidean":  # at the place of a body itself the direction is unknown: the row is NaN
+            gradient = torch.where(apart.unsqueeze(-1), away / root.unsqueeze(-1), math.nan)
+        share = torch.zeros_like(squared)
         if self.neighbour_velocity != "none":
-            b = b - dot(gradient, self._neighbours(measurement))
-        return Halfspaces(-gradient, b).where(present)
+            share = dot(gradient, self._neighbours(measurement))
+        return Geometry(squared, torch.where(apart, root, 0.0), gradient, share)
 
     def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
         """Bounds on the errors of the rows, with r = |dx| known up to e.
 
-        The direction is wrong by at most asin(e/r), and unknown if e >= r. The boundary phi(r) = alpha(h)/|dh/dx| grows
-        with r and is wrong by at most phi(r) - phi(r - e). Turning the row changes the slack by at most
-        2 sin(angle/2) |u - u_j|.
+        The boundary phi(r) = alpha(h)/|dh/dx| grows with r and is wrong by at most phi(r) - phi(r - e).
 
         Raises:
             InputError: class_k.power < 1/2 with squared distances: phi would not be monotone.
         """
-        self._require_monotone("positions have errors")
-        present, away = measurement.present, _away(measurement)
+        self.require_monotone("positions have errors")
+        sight, present = self.sight(measurement, bounds), measurement.present
+        r = torch.where(sight.clear, sight.r, 1.0)
+        Ds = self._safety_distance(measurement.radius, measurement.body_radii)
+        nearer = (r - torch.where(sight.clear, sight.e, 0.0)).clamp(min=1e-9)
+        moved = self._boundary(r, Ds) - self._boundary(nearer, Ds)
+        slack = torch.where(sight.clear, moved, math.inf) + sight.loose
+        return RowErrors(torch.where(present, sight.angle, 0.0), torch.where(present, slack, 0.0))
+
+    def sight(self, measurement: Measurement, bounds: ErrorBounds) -> Sight:
+        """How well each body is seen.
+
+        The direction is wrong by at most asin(e/r), and unknown if e >= r. Turning the row changes the slack by at most
+        2 sin(angle/2) |u - u_j|.
+        """
+        away = _away(measurement)
         e = bounds.position.unsqueeze(-1) + bounds.body_position
         squared = dot(away, away)
         clear = squared > e.square()
         r = torch.where(clear, squared, 1.0).sqrt()
-        e = torch.where(clear, e, 0.0)
-        angle = torch.where(clear, (e / r).clamp(max=1.0).arcsin(), math.pi)
+        angle = torch.where(clear, (torch.where(clear, e, 0.0) / r).clamp(max=1.0).arcsin(), math.pi)
         motion = torch.zeros_like(away) if measurement.u is None else measurement.u.unsqueeze(-2)
-        velocity_error = torch.zeros_like(r)
+        loose = torch.zeros_like(r)
         if self.neighbour_velocity != "none":
             motion = motion - self._neighbours(measurement)
-            velocity_error = bounds.body_velocity
-        turned = 2 * (angle / 2).sin() * motion.norm(dim=-1)
-        Ds = self._safety_distance(measurement.radius, measurement.body_radii)
-        moved = self._boundary(r, Ds) - self._boundary((r - e).clamp(min=1e-9), Ds)
-        slack = torch.where(clear, moved, math.inf) + turned + velocity_error
-        return RowErrors(torch.where(present, angle, 0.0), torch.where(present, slack, 0.0))
+            loose = bounds.body_velocity
+        loose = 2 * (angle / 2).sin() * motion.norm(dim=-1) + loose
+        return Sight(r, e, clear, angle, loose)
 
     def slack_left_out(self, measurement: Measurement) -> Float[Tensor, "*batch"]:
         """phi(R) - |u| - V, the least slack that the row of a body without a slot can have [m/s].
@@ -123,7 +168,7 @@ class CollisionAvoidance:
         Raises:
             InputError: class_k.power < 1/2 with squared distances: phi would not be monotone.
         """
-        self._require_monotone("bodies are left out")
+        self.require_monotone("bodies are left out")
         left_out, u = measurement.left_out, measurement.u
         assert left_out is not None
         assert u is not None
@@ -139,7 +184,8 @@ class CollisionAvoidance:
     def labels(self, bodies: Sequence[str]) -> list[str]:
         return [f"avoid {body}" for body in bodies]
 
-    def _require_monotone(self, where: str) -> None:
+    def require_monotone(self, where: str) -> None:
+        """Check that phi grows with the distance."""
         if self.distance == "squared" and self.class_k.power < 0.5:
             raise InputError("class_k.power", f"at least 1/2 where {where}", self.class_k.power)
 
