@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from torchfsid.identification.inverse_optimal import inverse_optimal_set as inverse_optimal_set
     from torchfsid.identification.kkt import solve_kkt as solve_kkt
     from torchfsid.observers.hybrid import HybridObserver as HybridObserver
+    from torchfsid.observers.safety import SafetyObserver as SafetyObserver
     from torchfsid.observers.set_membership import SetMembershipObserver as SetMembershipObserver
     from torchfsid.observers.ukf import ParameterUkf as ParameterUkf
     from torchfsid.programmes.layers import ChebyshevCentre as ChebyshevCentre
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from torchfsid.robots.tasks import Saturation as Saturation
     from torchfsid.robots.tasks import UnknownGainGoalTask as UnknownGainGoalTask
     from torchfsid.robots.tasks import VelocityTask as VelocityTask
+    from torchfsid.robots.unknown_avoidance import UnknownAvoidance as UnknownAvoidance
     from torchfsid.sets.feasible_set import FeasibleSet as FeasibleSet
 
 _HOME = {
@@ -48,6 +50,7 @@ _HOME = {
     "identification.inverse_optimal": ["inverse_optimal_set"],
     "identification.kkt": ["solve_kkt"],
     "observers.hybrid": ["HybridObserver"],
+    "observers.safety": ["SafetyObserver"],
     "observers.set_membership": ["SetMembershipObserver"],
     "observers.ukf": ["ParameterUkf"],
     "programmes.layers": ["ChebyshevCentre", "ProjectOnto"],
@@ -69,6 +72,7 @@ _HOME = {
         "UnknownGainGoalTask",
         "VelocityTask",
     ],
+    "robots.unknown_avoidance": ["UnknownAvoidance"],
     "sets.feasible_set": ["FeasibleSet"],
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}

@@ -22,7 +22,7 @@ from functools import cached_property, partial
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchfsid.errors import InputError
@@ -69,6 +69,9 @@ class ObservationModel:
     def __post_init__(self) -> None:
         if self.kind == "inverse_optimal" and self.noise is None:
             raise InputError("noise", "a NoiseBound, since the set is inverse_optimal", None)
+        for barrier in self.barriers:
+            if not callable(barrier):
+                raise InputError("barriers", "barriers with known parameters (or a SafetyObserver)", barrier)
         if self.kind == "critical_region" and self.task.saturation is not None:
             raise InputError("kind", "inverse_optimal, since the nominal control is clipped", self.kind)
         if not self.active_tolerance > 0:
@@ -88,6 +91,7 @@ class Evidence:
         excess: the violation of every row beyond its bound [m/s]; positive if it is violated.
         hard: the rows that no controller may violate.
         solve: solves the KKT conditions. Use `kkt` instead.
+        omega_without: the half-spaces of theta for k items if a row of each were inactive: called with (items, rows).
     """
 
     omega: Halfspaces
@@ -97,11 +101,21 @@ class Evidence:
     excess: Float[Tensor, "B m"]
     hard: Bool[Tensor, "m"]
     solve: Callable[[], KktSolution]
+    omega_without: Callable[[Int[Tensor, "k"], Int[Tensor, "k"]], Halfspaces]
 
     @cached_property
     def kkt(self) -> KktSolution:
         """The control u* = G theta + f at the observed active set. It is solved once, on first use."""
         return self.solve()
+
+    def select(self, items: Int[Tensor, "k"]) -> Evidence:
+        """The evidence of some items of the batch."""
+        source = None if self.omega.source is None else self.omega.source[items]
+        return Evidence(
+            Halfspaces(self.omega.A[items], self.omega.b[items], source), self.informative[items],
+            self.alarmed[items], self.slack[items], self.excess[items], self.hard,
+            lambda: self.kkt.select(items), lambda chosen, rows: self.omega_without(items[chosen], rows),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -118,7 +132,7 @@ class _Sample:
         bound: the largest slack of an active row [m/s], broadcasting with (B, m).
         ball: a bound on the error of u [m/s], broadcasting with (B,).
         drift: a bound on the error of C theta + d [m/s], broadcasting with (B,).
-        row_errors: bounds on the errors of the rows; None if they are exact.
+        row_errors: bounds on the errors of the rows; None if their directions are exact.
         corners: the vertices of Theta; None if they are not needed.
     """
 
@@ -133,6 +147,19 @@ class _Sample:
     drift: Float[Tensor, "*#B"]
     row_errors: RowErrors | None
     corners: Float[Tensor, "B v p"] | None
+
+    def without(self, items: Int[Tensor, "k"], rows: Int[Tensor, "k"]) -> _Sample:
+        """The samples at the places `items`, as if the row of the same place in `rows` were inactive."""
+        k, m = torch.arange(len(items), device=items.device), self.rows.rows
+        errors = self.row_errors
+        return _Sample(
+            Halfspaces(self.rows.A[items], self.rows.b[items]), torch.zeros_like(self.hard), self.u[items],
+            self.C[items], self.d[items], self.usable[items],
+            self.bound.expand(len(self.u), m)[items].index_put((k, rows), self.bound.new_tensor(-torch.inf)),
+            self.ball.expand(len(self.u))[items], self.drift.expand(len(self.u))[items],
+            None if errors is None else RowErrors(errors.angle[items], errors.slack[items]),
+            None if self.corners is None else self.corners[items],
+        )  # fmt: skip
 
 
 def evidence(
@@ -152,10 +179,17 @@ def evidence(
         InputError: the measurement has no velocities, they are not finite for an observed robot, the measurement does
             not fit theta, or `compiled` is True where it is not possible.
     """
-    sample = _sample(model, theta, measurement.observed_only())
-    if _can_be_compiled(model, sample, compiled):
-        return _compiled(model, sample)
-    return _in_torch(model, sample)
+    return _read(model, _sample(model, theta, measurement.observed_only()), compiled)
+
+
+def _read(model: ObservationModel, sample: _Sample, compiled: bool | None) -> Evidence:
+    return (_compiled if _can_be_compiled(model, sample, compiled) else _in_torch)(model, sample)
+
+
+def _omega_without(
+    model: ObservationModel, sample: _Sample, items: Int[Tensor, "k"], rows: Int[Tensor, "k"]
+) -> Halfspaces:
+    return _read(model, sample.without(items, rows), None).omega
 
 
 def _sample(model: ObservationModel, theta: FeasibleSet, measurement: Measurement) -> _Sample:
@@ -177,8 +211,12 @@ def _sample(model: ObservationModel, theta: FeasibleSet, measurement: Measuremen
     if errors is not None or model.task.saturation is not None:
         corners = theta.vertices().repeat(items // max(robots, 1), 1, 1)
         if errors is not None:
-            of_rows = row_errors(model.barriers, parts, measurement, errors)
-            bound, drift = bound + of_rows.slack, model.task.drift(errors, corners.abs().amax(-2))
+            drift = model.task.drift(errors, corners.abs().amax(-2))
+    if errors is None and any(getattr(barrier, "uncertain", False) for barrier in model.barriers):
+        errors = ErrorBounds.none(measurement)
+    if errors is not None:
+        of_rows = row_errors(model.barriers, parts, measurement, errors)
+        bound = bound + of_rows.slack
     usable = ~controller_failed(model.barriers, measurement, rows, of_rows)
     if measurement.observed is not None:
         usable = usable & measurement.observed
@@ -188,9 +226,10 @@ def _sample(model: ObservationModel, theta: FeasibleSet, measurement: Measuremen
             error = error + measurement.position_error
         usable = usable & left_out_inactive(model.barriers, measurement, largest + noise.neighbour_velocity, error)
 
+    turned = of_rows if of_rows is not None and bool((of_rows.angle > 0).any()) else None
     return _Sample(
         rows, ~torch.tensor(soft, dtype=torch.bool, device=u.device), u, C.to(torch.float64), d.to(torch.float64),
-        usable, bound, ball, drift, of_rows, corners,
+        usable, bound, ball, drift, turned, corners,
     )  # fmt: skip
 
 
@@ -219,7 +258,8 @@ def _in_torch(model: ObservationModel, sample: _Sample) -> Evidence:
             model.task.saturation, None if sample.corners is None else sample.corners @ C.mT + d.unsqueeze(-2),
         )  # fmt: skip
     omega = omega.where(informative.unsqueeze(-1))
-    return Evidence(omega, informative, alarmed, slack, excess, sample.hard, solve)
+    without = partial(_omega_without, model, sample)
+    return Evidence(omega, informative, alarmed, slack, excess, sample.hard, solve, without)
 
 
 def _can_be_compiled(model: ObservationModel, sample: _Sample, wanted: bool | None) -> bool:
@@ -249,4 +289,5 @@ def _compiled(model: ObservationModel, sample: _Sample) -> Evidence:
     informative, alarmed, slack, excess = map(torch.from_numpy, judged)
     solved = KktSolution(*map(torch.from_numpy, kkt))
     omega = Halfspaces(*map(torch.from_numpy, rows))
-    return Evidence(omega, informative, alarmed, slack, excess, sample.hard, lambda: solved)
+    without = partial(_omega_without, model, sample)
+    return Evidence(omega, informative, alarmed, slack, excess, sample.hard, lambda: solved, without)

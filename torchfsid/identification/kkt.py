@@ -25,7 +25,7 @@ The letters A-E are names for (K, rank). They are computed for tables only.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import torch
@@ -65,6 +65,10 @@ class KktSolution:
     n_active: Int[Tensor, "*batch"]
     rank: Int[Tensor, "*batch"]
     case: Int[Tensor, "*batch"]
+
+    def select(self, items: Int[Tensor, "k"]) -> KktSolution:
+        """The solutions at the places `items` of a batch (B,)."""
+        return KktSolution(*(getattr(self, part.name)[items] for part in fields(self)))
 
 
 def solve_kkt(

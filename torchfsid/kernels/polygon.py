@@ -255,7 +255,7 @@ def area_of(ring, n):
 @launcher
 @no_type_check
 def clip(polygons, A, b, stamp, source, first_label, most):
-    """Cut all polygons by their rows A (B, R, 2), b and source (B, R), with the times `stamp` (B,).
+    """Cut all polygons by their rows A (B, R, 2), b and source (B, R), with the times `stamp` (B, R).
 
     `polygons` are (vertices, A, b, time, source, label, count, reach), as in `Polygon`. New edges are labelled from
     `first_label` on, and `entered` lists their rows k R + r. A `first_label` of 0 means no labels. Polygons with more
@@ -292,7 +292,7 @@ def clip(polygons, A, b, stamp, source, first_label, most):
             for i, e in enumerate((row, before, after)):
                 lost_A[k, i, 0], lost_A[k, i, 1] = lines[e, 0], lines[e, 1]
                 lost_b[k, i] = lines[e, 2]
-                lost_time[k, i] = time[k, e] if e < V else stamp[k]
+                lost_time[k, i] = time[k, e] if e < V else stamp[k, e - V]
                 lost_source[k, i] = ring_source[k, e] if e < V else source[k, e - V]
         if shrunk[k] and n > most:
             n = merge_ring(ring, edge, n, most, lines, spare, spare_edge)
@@ -318,7 +318,7 @@ def clip(polygons, A, b, stamp, source, first_label, most):
             if e < V:
                 to_time[k, i], to_source[k, i], to_label[k, i] = time[k, e], ring_source[k, e], label[k, e]
             else:
-                to_time[k, i], to_source[k, i] = stamp[k], source[k, e - V]
+                to_time[k, i], to_source[k, i] = stamp[k, e - V], source[k, e - V]
                 to_label[k, i] = 0
                 if first_label > 0:
                     to_label[k, i], entered[new] = first_label + new, k * R + e - V

@@ -61,6 +61,7 @@ class SetEstimate:
         evidence: the evidence of this measurement alone.
         informative: whether the sample was used.
         status: a `Status` per robot, the worst so far.
+        safety: Psi of every robot, where the safety parameters are unknown (`SafetyObserver`).
     """
 
     t: float
@@ -68,6 +69,7 @@ class SetEstimate:
     evidence: Evidence
     informative: Bool[Tensor, "B"]
     status: Int[Tensor, "B"]
+    safety: FeasibleSet | None = None
 
     @property
     def kkt(self) -> KktSolution:

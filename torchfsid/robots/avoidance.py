@@ -132,7 +132,7 @@ class CollisionAvoidance:
             InputError: class_k.power < 1/2 with squared distances: phi would not be monotone.
         """
         self.require_monotone("positions have errors")
-        sight, present = self.sight(measurement, bounds), measurement.present
+        sight, present = self.sight(measurement, bounds, self.geometry(measurement)), measurement.present
         r = torch.where(sight.clear, sight.r, 1.0)
         Ds = self._safety_distance(measurement.radius, measurement.body_radii)
         nearer = (r - torch.where(sight.clear, sight.e, 0.0)).clamp(min=1e-9)
@@ -140,25 +140,23 @@ class CollisionAvoidance:
         slack = torch.where(sight.clear, moved, math.inf) + sight.loose
         return RowErrors(torch.where(present, sight.angle, 0.0), torch.where(present, slack, 0.0))
 
-    def sight(self, measurement: Measurement, bounds: ErrorBounds) -> Sight:
+    def sight(self, measurement: Measurement, bounds: ErrorBounds, seen: Geometry) -> Sight:
         """How well each body is seen.
 
         The direction is wrong by at most asin(e/r), and unknown if e >= r. Turning the row changes the slack by at most
         2 sin(angle/2) |u - u_j|.
         """
-        away = _away(measurement)
         e = bounds.position.unsqueeze(-1) + bounds.body_position
-        squared = dot(away, away)
-        clear = squared > e.square()
-        r = torch.where(clear, squared, 1.0).sqrt()
+        clear, exact = seen.squared > e.square(), not bool(e.any())
+        loose = torch.zeros_like(e) if self.neighbour_velocity == "none" else bounds.body_velocity
+        if exact and bool(clear.all()):
+            return Sight(seen.r, e, clear, e, loose)
+        r = torch.where(clear, seen.squared, 1.0).sqrt()
         angle = torch.where(clear, (torch.where(clear, e, 0.0) / r).clamp(max=1.0).arcsin(), math.pi)
-        motion = torch.zeros_like(away) if measurement.u is None else measurement.u.unsqueeze(-2)
-        loose = torch.zeros_like(r)
+        motion = torch.zeros_like(seen.gradient) if measurement.u is None else measurement.u.unsqueeze(-2)
         if self.neighbour_velocity != "none":
             motion = motion - self._neighbours(measurement)
-            loose = bounds.body_velocity
-        loose = 2 * (angle / 2).sin() * motion.norm(dim=-1) + loose
-        return Sight(r, e, clear, angle, loose)
+        return Sight(r, e, clear, angle, 2 * (angle / 2).sin() * motion.norm(dim=-1) + loose)
 
     def slack_left_out(self, measurement: Measurement) -> Float[Tensor, "*batch"]:
         """phi(R) - |u| - V, the least slack that the row of a body without a slot can have [m/s].

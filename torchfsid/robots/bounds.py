@@ -73,9 +73,16 @@ class ErrorBounds(NamedTuple):
         added = measurement.position_error, measurement.body_position_error, measurement.body_velocity_error
         if position == velocity == 0 and all(error is None for error in added):
             return None
-        robots, bodies = torch.zeros_like(measurement.x[..., 0]), torch.zeros_like(measurement.bodies[..., 0])
-        declared = robots + position, bodies + position, bodies + velocity
+        declared = (
+            bound + size for bound, size in zip(cls.none(measurement), (position, position, velocity), strict=True)
+        )
         return cls(*(d if a is None else d + a for d, a in zip(declared, added, strict=True)))
+
+    @classmethod
+    def none(cls, measurement: Measurement) -> ErrorBounds:
+        """The bounds of an exact measurement: zero."""
+        robots, bodies = torch.zeros_like(measurement.x[..., 0]), torch.zeros_like(measurement.bodies[..., 0])
+        return cls(robots, bodies, bodies)
 
 
 class RowErrors(NamedTuple):

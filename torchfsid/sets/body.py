@@ -93,7 +93,7 @@ class Body(Protocol):
         self,
         A: Float[Tensor, "B R p"],
         b: Float[Tensor, "B R"],
-        time: Float[Tensor, "B"],
+        time: Float[Tensor, "B R"],
         source: Int[Tensor, "B R"],
         most: int,
     ) -> Clipped:

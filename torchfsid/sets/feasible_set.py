@@ -130,13 +130,13 @@ class FeasibleSet:
     def intersect(
         self,
         halfspaces: Halfspaces,
-        time: float | Float[Tensor, "*batch"] = float("nan"),
+        time: float | Float[Tensor, "*#batch m"] = float("nan"),
     ) -> FeasibleSet:
         """The part of the set inside the half-spaces.
 
-        New facets keep `time` [s] and the rows' `source` (default: 0, 1, ...). A row that only touches the set within
-        round-off is moved outward by that round-off and then applied, so that the result is an outer set. If merging
-        facets would cost more than the cut has gained, the set stays as it was.
+        New facets keep the `time` [s] and the `source` of their rows (default: 0, 1, ...). A row that only touches the
+        set within round-off is moved outward by that round-off and then applied, so that the result is an outer set. If
+        merging facets would cost more than the cut has gained, the set stays as it was.
 
         Raises:
             InputError: dimension or batch do not fit, or a row is NaN or infinite.
@@ -152,11 +152,11 @@ class FeasibleSet:
         if self.any_empty:
             halfspaces = halfspaces.where(~self.is_empty.unsqueeze(-1))
         source = torch.arange(m, device=self.outcome.device) if halfspaces.source is None else halfspaces.source
-        stamp = torch.as_tensor(time, dtype=torch.float64, device=self.outcome.device).expand(self.batch_shape)
+        stamp = torch.as_tensor(time, dtype=torch.float64, device=self.outcome.device).expand(*self.batch_shape, m)
         rows = (
             self._flat(halfspaces.A, (m, p)),
             self._flat(halfspaces.b, (m,)),
-            self._flat(stamp, ()),
+            self._flat(stamp, (m,)).contiguous(),
             self._flat(source, (m,)),
         )
         clipped = self.body.clip(*rows, self.max_facets)
@@ -173,7 +173,7 @@ class FeasibleSet:
                 found.source.reshape((*shape, p + 1)),
             )
             against = _choose(self.is_empty, against, fresh)
-        last_cut = torch.where(clipped.shrunk.reshape(shape), stamp, self.last_cut)
+        last_cut = torch.where(clipped.shrunk.reshape(shape), stamp.amax(-1), self.last_cut)
         return replace(self, body=body, outcome=outcome, contradiction=against, last_cut=last_cut)
 
     def where(self, mask: Bool[Tensor, "*batch"], other: FeasibleSet) -> FeasibleSet:

@@ -132,7 +132,7 @@ class Polygon:
         self,
         A: Float[Tensor, "B R 2"],
         b: Float[Tensor, "B R"],
-        time: Float[Tensor, "B"],
+        time: Float[Tensor, "B R"],
         source: Int[Tensor, "B R"],
         most: int,
     ) -> Clipped:

@@ -92,7 +92,7 @@ class Polytope:
         self,
         A: Float[Tensor, "B R p"],
         b: Float[Tensor, "B R"],
-        time: Float[Tensor, "B"],
+        time: Float[Tensor, "B R"],
         source: Int[Tensor, "B R"],
         most: int,
     ) -> Clipped:
@@ -111,7 +111,7 @@ class Polytope:
             # Where merging costs more than the cut has gained, the polytope stays as it was.
             if cell is found.cell or cell.content <= cells[i].content:
                 cells[i], origins[i], shrunk[i] = cell, place[found.origin[kept]], True
-        table = _Rows.join(self._rows(), (A, b, time.unsqueeze(-1).expand(B, R), source))
+        table = _Rows.join(self._rows(), (A, b, time, source))
         outcomes, cut, conflict = (torch.as_tensor(field, device=device) for field in (outcome, shrunk, against))
         contradiction = Contradiction(*(field.detach() for field in table.at(conflict, nan, nan)))
         return Clipped(self._of(cells, origins, table) if shrunk.any() else self, outcomes, cut, contradiction)
