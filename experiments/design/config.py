@@ -14,7 +14,7 @@ from experiments.teams import TeamConfig
 from torchfsid.config.barriers import AvoidanceConfig
 from torchfsid.config.documents import Strict, wrong
 from torchfsid.config.observers import UkfConfig
-from torchfsid.config.quantities import NonNegative, Number, PlanarVector, Positive
+from torchfsid.config.quantities import NonNegative, Number, PlanarVector, Positive, known
 
 Count = Annotated[int, Field(strict=True, ge=1)]
 Several = Annotated[int, Field(strict=True, ge=2)]
@@ -66,8 +66,9 @@ class DesignConfig(Strict):
     @property
     def safety_distance(self) -> float:
         """The safety distance of the barrier [m]."""
-        assert self.avoidance.safety_distance is not None
-        return self.avoidance.safety_distance
+        distance = known(self.avoidance.safety_distance)
+        assert distance is not None
+        return distance
 
     @model_validator(mode="after")
     def _can_be_run(self) -> DesignConfig:
@@ -75,6 +76,8 @@ class DesignConfig(Strict):
             raise wrong(f"expected 1 to {MAX_STEPS} steps of dt = {self.dt} s, got {self.duration} s", "duration")
         if self.avoidance.margin is not None or self.avoidance.safety_distances:
             raise wrong("bodies have no names and no radius here: give one safety_distance", "avoidance")
+        if self.avoidance.is_unknown:
+            raise wrong("expected numbers, not [low, high]", "avoidance")
         if self.avoidance.neighbour_velocity != "none":
             raise wrong("expected none", "avoidance.neighbour_velocity")
         return self

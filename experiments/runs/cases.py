@@ -75,7 +75,8 @@ def _places(case: CaseConfig, config: CasesConfig) -> tuple[Tensor, Tensor, Tens
         Offsets (m, 2) from the robot at the start [m], radii (m,) [m], and which slots hold a body (m,).
     """
     slots, taken = _slots(config), len(case.bodies)
-    gamma, margin = config.avoidance.class_k.gain, config.avoidance.margin
+    gamma, margin = known(config.avoidance.class_k.gain), known(config.avoidance.margin)
+    assert gamma is not None
     assert margin is not None
     offsets = torch.ones(slots, 2, dtype=torch.float64)
     radii = torch.ones(slots, dtype=torch.float64)

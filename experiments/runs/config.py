@@ -9,14 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
 from torchfsid.config.barriers import AvoidanceConfig, BarrierConfig
 from torchfsid.config.documents import Strict, wrong
 from torchfsid.config.observers import NoiseConfig, PriorConfig, UkfConfig
-from torchfsid.config.quantities import BodyName, NonNegative, Number, PlanarVector, Positive
+from torchfsid.config.quantities import BodyName, NonNegative, Number, PlanarVector, Positive, known
 from torchfsid.config.tasks import GoalConfig
 
 if TYPE_CHECKING:
@@ -132,8 +132,15 @@ class ExperimentConfig(Strict):
     @property
     def safety_distance(self) -> float | None:
         """The safety distance of the first barrier that has one [m]. Bodies are drawn in this size."""
-        distances = (getattr(barrier, "safety_distance", None) for barrier in self.barriers)
+        distances = (known(getattr(barrier, "safety_distance", None)) for barrier in self.barriers)
         return next((distance for distance in distances if distance is not None), None)
+
+    @model_validator(mode="after")
+    def _can_be_simulated(self) -> Self:
+        for i, barrier in enumerate(self.barriers):
+            if barrier.is_unknown:
+                raise wrong("expected numbers, not [low, high]: robots that are simulated have them", f"barriers[{i}]")
+        return self
 
     def build_sets(self, kind: SetKind, task: Task, barriers: Sequence[Barrier], robots: int) -> SetMembershipObserver:
         """The observer of one kind of set.

@@ -177,7 +177,7 @@ def ending(belief: Belief, samples: list[Measurement], goals: Tensor, noise: Noi
     consistency = Consistency(
         samples, belief.task, belief.barriers, prior(goals), neighbour_velocity=noise.neighbour_velocity
     )
-    _, relaxed = consistency.sets(torch.as_tensor(noise.velocity).expand(len(goals)) / 2)
+    relaxed = consistency.sets(torch.as_tensor(noise.velocity).expand(len(goals)) / 2).fits
     return Ending(
         flagged=int((~ok).sum()),
         right=int((ok & ~silent).sum()),

@@ -16,8 +16,7 @@ from torch import Tensor
 
 from torchfsid.commands.declared_log import AUTO_FACTOR, DeclaredLog
 from torchfsid.commands.results import constraint_name, seconds
-from torchfsid.observers.consistency import Consistency
-from torchfsid.sets.feasible_set import FeasibleSet
+from torchfsid.observers.consistency import Consistency, Fit
 
 SHIFTS = (-2, -1, 1, 2)
 """Misalignments of velocities and positions that are looked for [samples]."""
@@ -194,9 +193,9 @@ def check(declared: DeclaredLog) -> Check:
         if len(declared.log.t) > abs(shift) + 1:
             shifts[shift] = float(declared.shifted(shift).consistency().smallest_bounds(overall).max())
 
-    theta, _ = consistency.sets(enough)
-    residuals = consistency.residuals(theta, fastest)
-    faults = _Faults(declared.row_labels, consistency, theta, velocity, residuals)
+    sets = consistency.sets(enough)
+    residuals = consistency.residuals(sets, fastest)
+    faults = _Faults(declared.row_labels, consistency, sets, velocity, residuals)
     robots = []
     for i, robot in enumerate(declared.robots):
         of_robot = residuals[:, i]
@@ -222,15 +221,13 @@ def check(declared: DeclaredLog) -> Check:
 class _Faults:
     """For all samples, at the declared bound: the row that a sample contradicts, and by how much."""
 
-    def __init__(
-        self, labels: Sequence[str], consistency: Consistency, theta: FeasibleSet, velocity: float, residuals: Tensor
-    ):
+    def __init__(self, labels: Sequence[str], consistency: Consistency, sets: Fit, velocity: float, residuals: Tensor):
         self.labels = labels
         at_odds, blamed, excess, measured = [], [], [], []
         for block in consistency.blocks:
-            reading = consistency.read(block, theta, block.repeated(torch.full_like(residuals[0], velocity)))
+            reading = consistency.read(block, sets, block.repeated(torch.full_like(residuals[0], velocity)))
             # How far Theta is beyond each half-space [m/s]: rows come from unit normals over the control.
-            corners = block.repeated(theta.vertices())
+            corners = block.repeated(sets.theta.vertices())
             beyond = (reading.omega.A @ corners.mT).amin(-1) - reading.omega.b
             worst = beyond.argmax(-1, keepdim=True)
             assert reading.omega.source is not None

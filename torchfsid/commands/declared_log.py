@@ -15,6 +15,7 @@ from torchfsid.observers.consistency import Consistency
 from torchfsid.robots.barriers import Barrier
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.tasks import Task
+from torchfsid.robots.unknown_avoidance import UnknownAvoidance
 from torchfsid.sets.feasible_set import FeasibleSet
 
 AUTO_FACTOR = 2.0
@@ -42,17 +43,15 @@ class DeclaredLog:
     log: Log
     robots: list[str] = field(init=False)
     task: Task = field(init=False)
-    barriers: list[Barrier] = field(init=False)
+    barriers: list[Barrier | UnknownAvoidance] = field(init=False)
     prior: FeasibleSet = field(init=False)
 
     def __post_init__(self) -> None:
-        config = self.config
+        config, radius = self.config, None if self.log.radius is None else self.log.radius.tolist()
         if self.log.x.shape[-1] != 2:
             raise ConfigError("task: planar controllers only, but the log has a column z")
         if config.velocity == "logged" and self.log.u is None:
             raise ConfigError("velocity: 'logged', but the log has no velocities vx, vy (use 'differentiated')")
-        for declared in config.barriers:
-            declared.require_radii(None if self.log.radius is None else self.log.radius.tolist())
         if len(self.log.bodies) > 1 and not (self.log.seen.sum(axis=1) > 1).any():
             raise ConfigError(f"{self.log.source}: no two bodies share a time, so none would ever see another")
         if config.velocity == "differentiated":
@@ -60,7 +59,7 @@ class DeclaredLog:
         self.log = bridged(self.log)
         self.robots = config.robots(self.log.bodies)
         self.task = config.task.build(self.log.bodies)
-        self.barriers = [barrier.build(self.log.bodies) for barrier in config.barriers]
+        self.barriers = config.build_barriers(self.log.bodies, radius)
         self.prior = config.prior.build(len(self.robots))
 
     @property

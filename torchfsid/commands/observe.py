@@ -15,7 +15,7 @@ from torchfsid.config.observe import ObserveConfig
 from torchfsid.identification.kkt import CASES
 from torchfsid.logs.log import Log
 from torchfsid.observers.hybrid import HybridObserver
-from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.observers.safety import SetObserver
 from torchfsid.outcome import Status
 from torchfsid.robots.measurement import Measurement
 
@@ -69,8 +69,8 @@ class Observation:
     """
 
     declared: DeclaredLog
-    sets: SetMembershipObserver = field(init=False)
-    observer: SetMembershipObserver | HybridObserver = field(init=False)
+    sets: SetObserver = field(init=False)
+    observer: SetObserver | HybridObserver = field(init=False)
     smallest_bounds: dict[str, float] | None = field(init=False, default=None)
     _cases: dict[str, Counter[str]] = field(init=False)
 
@@ -121,7 +121,7 @@ class Observation:
         if sets.prior.dim != 2:
             return []
         half = torch.full((len(self.robots),), self.velocity_bound / AUTO_FACTOR, dtype=torch.float64)
-        _, suffices = self.declared.consistency().sets(half)
+        suffices = self.declared.consistency().sets(half).fits
         needs_more = (sets.status == Status.OK) & ~suffices
         return [robot for robot, strained in zip(self.robots, needs_more.tolist(), strict=True) if strained]
 

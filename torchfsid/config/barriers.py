@@ -5,8 +5,10 @@ Each barrier says what it needs from a log: the bodies' radii, and their velocit
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Literal
+from itertools import combinations
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
@@ -15,16 +17,34 @@ from torchfsid.config.quantities import (
     BodyName,
     Flag,
     NonNegative,
+    NonNegativeOrInterval,
     PlanarVector,
     Positive,
+    PositiveOrInterval,
+    as_interval,
+    known,
     require_body,
     require_box,
+    require_interval,
 )
 from torchfsid.errors import ConfigError
 
 if TYPE_CHECKING:
     from torchfsid.robots.avoidance import ClassK
     from torchfsid.robots.barriers import Barrier
+    from torchfsid.robots.unknown_avoidance import UnknownAvoidance
+
+
+class UnknownClassKConfig(Strict):
+    """`ClassKConfig` whose gain may be unknown within [low, high]."""
+
+    gain: PositiveOrInterval
+    power: Positive = 1.0
+
+    @model_validator(mode="after")
+    def _is_ordered(self) -> UnknownClassKConfig:
+        require_interval("gain", self.gain)
+        return self
 
 
 class ClassKConfig(Strict):
@@ -43,6 +63,8 @@ class ClassKConfig(Strict):
 class AvoidanceConfig(Strict):
     """`CollisionAvoidance`, by `safety_distance`, or by `margin` if the log has radii. Exactly one of the two is given.
 
+    Gain, safety distance and margin may be unknown within [low, high]. Then this is an `UnknownAvoidance`.
+
     Attributes:
         distance: form of h, see `robots.avoidance`.
         safety_distance: distance between centres [m].
@@ -51,16 +73,18 @@ class AvoidanceConfig(Strict):
         class_k: the function alpha of the barrier.
         neighbour_velocity: which velocities of other bodies the rows use.
         soft: the controller may violate the rows.
+        shared: whether unknown values are those of the whole team, or of each robot.
     """
 
     kind: Literal["avoidance"] = "avoidance"
     distance: Literal["squared", "euclidean"] = "squared"
-    safety_distance: Positive | None = None
+    safety_distance: PositiveOrInterval | None = None
     safety_distances: dict[BodyName, Positive] = Field(default_factory=dict)
-    margin: NonNegative | None = None
-    class_k: ClassKConfig
+    margin: NonNegativeOrInterval | None = None
+    class_k: UnknownClassKConfig
     neighbour_velocity: Literal["none", "current", "previous"] = "none"
     soft: Flag = False
+    shared: Literal["team", "robot"] | None = None
 
     @model_validator(mode="after")
     def _one_distance(self) -> AvoidanceConfig:
@@ -70,7 +94,18 @@ class AvoidanceConfig(Strict):
             raise wrong(
                 "bodies have a distance of their own beside a safety_distance, not a margin", "safety_distances"
             )
+        require_interval("safety_distance", self.safety_distance)
+        require_interval("margin", self.margin)
+        if self.safety_distances and self.is_unknown:
+            raise wrong("bodies have no distances of their own where safety parameters are unknown", "safety_distances")
+        if self.shared is not None and not self.is_unknown:
+            raise wrong("expected an unknown gain or distance [low, high] to be shared", "shared")
         return self
+
+    @property
+    def is_unknown(self) -> bool:
+        """Is a value given as [low, high]?"""
+        return any(isinstance(value, tuple) for value in (self.class_k.gain, self.safety_distance, self.margin))
 
     @property
     def uses_radius(self) -> bool:
@@ -85,31 +120,57 @@ class AvoidanceConfig(Strict):
         """
         if self.margin is not None and radius is None:
             raise ConfigError("barriers: a margin needs the radii, but the log has none (column radius, bag.radius)")
-        if self.margin is not None and radius is not None and self.margin + min(radius) <= 0:
+        if self.margin is not None and radius is not None and as_interval(self.margin)[0] + min(radius) <= 0:
             raise ConfigError("barriers: a margin of 0 needs positive radii")
 
     def build(self, bodies: Sequence[str]) -> Barrier:
-        """The barrier among these bodies.
+        """The barrier among these bodies. Its values are known.
 
         Raises:
             ConfigError: `safety_distances` names a body that is not there.
         """
         import torch
 
-        from torchfsid.robots.avoidance import CollisionAvoidance
+        from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 
         for name in self.safety_distances:
             require_body(f"safety_distances.{name}", name, bodies)
-        Ds = self.safety_distance
+        gain, Ds, margin = (known(value) for value in (self.class_k.gain, self.safety_distance, self.margin))
+        assert gain is not None
         if self.safety_distances:
             Ds = torch.tensor([self.safety_distances.get(body, Ds) for body in bodies], dtype=torch.float64)
-        return CollisionAvoidance(
-            self.class_k.build(), Ds, self.margin, self.distance, self.neighbour_velocity, self.soft
+        class_k = ClassK(gain, self.class_k.power)
+        return CollisionAvoidance(class_k, Ds, margin, self.distance, self.neighbour_velocity, self.soft)
+
+    def build_unknown(self, radius: Sequence[float] | None) -> UnknownAvoidance:
+        """The barrier with intervals for all values, among bodies with these radii [m]."""
+        from torchfsid.robots.unknown_avoidance import UnknownAvoidance
+
+        between = None if self.safety_distance is None else as_interval(self.safety_distance)
+        margin = None if self.margin is None else as_interval(self.margin)
+        return UnknownAvoidance(
+            as_interval(self.class_k.gain),
+            between,
+            margin,
+            self.class_k.power,
+            self.distance,
+            self.neighbour_velocity,
+            self.soft,
+            self.shared or "team",
+            _commonest_sum(radius) if margin is not None and radius is not None else 0.0,
         )
+
+
+def _commonest_sum(radius: Sequence[float]) -> float:
+    """The sum of radii that most pairs of bodies have [m]."""
+    pairs = Counter(sum(pair) for pair in combinations(radius, 2)) or Counter([2 * radius[0]])
+    return max(pairs, key=lambda total: (pairs[total], total))
 
 
 class _RobotsOwn(Strict):
     """A barrier whose rows do not depend on other bodies."""
+
+    is_unknown: ClassVar[bool] = False
 
     @property
     def uses_radius(self) -> bool:

@@ -43,8 +43,9 @@ class Strict(BaseModel):
 
 Config = TypeVar("Config", bound=Strict)
 
-CHOICES = frozenset({"<section>", "<false>"})
-"""Tags of `Section | Literal[False]`. Pydantic puts them into paths, but they are no keys."""
+CHOICES = frozenset({"<section>", "<false>", "<number>", "<interval>"})
+"""Tags of values of two kinds, a section or False, a number or an interval. Pydantic puts them into paths, but they are
+no keys."""
 
 
 def load(path: str | Path, model: type[Config], overrides: Iterable[str] = ()) -> Config:

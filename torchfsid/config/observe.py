@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from torchfsid.config.bags import BagConfig
-from torchfsid.config.barriers import BarrierConfig
+from torchfsid.config.barriers import AvoidanceConfig, BarrierConfig
 from torchfsid.config.documents import Strict, wrong
 from torchfsid.config.observers import ObservedNoiseConfig, PriorConfig, UkfConfig
 from torchfsid.config.quantities import BodyName, Positive, require_body
@@ -21,9 +21,11 @@ from torchfsid.errors import ConfigError
 
 if TYPE_CHECKING:
     from torchfsid.observers.hybrid import HybridObserver
+    from torchfsid.observers.safety import SafetyObserver
     from torchfsid.observers.set_membership import SetMembershipObserver
     from torchfsid.robots.barriers import Barrier
     from torchfsid.robots.tasks import Task
+    from torchfsid.robots.unknown_avoidance import UnknownAvoidance
 
 
 def _choice(value: Any) -> str:
@@ -72,6 +74,11 @@ class ObserveConfig(Strict):
         expected, got = self.task.parameters, len(self.prior.lower)
         if got != expected:
             raise wrong(f"task '{self.task.kind}' has {expected} parameters, lower and upper have {got}", "prior")
+        unknown = [i for i, barrier in enumerate(self.barriers) if barrier.is_unknown]
+        if len(unknown) > 1:
+            raise wrong("one barrier may have unknown parameters, and another one has", f"barriers[{unknown[1]}]")
+        if unknown and self.set == "critical_region":
+            raise wrong("critical_region needs known safety parameters, take inverse_optimal", "set")
         if self.set == "critical_region" and self.task.is_clipped:
             raise wrong("critical_region knows no saturation or dead zone, take inverse_optimal", "set")
         if self.noise.velocity == "auto" and self.on_inconsistent == "reset":
@@ -81,6 +88,26 @@ class ObserveConfig(Strict):
     def with_velocity_bound(self, bound: float) -> ObserveConfig:
         """The same configuration with `noise.velocity` = `bound` [m/s]."""
         return self.model_copy(update={"noise": self.noise.model_copy(update={"velocity": bound})})
+
+    @property
+    def is_unknown(self) -> bool:
+        """Has a barrier unknown safety parameters?"""
+        return any(barrier.is_unknown for barrier in self.barriers)
+
+    def build_barriers(self, bodies: Sequence[str], radius: Sequence[float] | None) -> list[Barrier | UnknownAvoidance]:
+        """The barriers among these bodies, with these radii [m].
+
+        Raises:
+            ConfigError: a barrier needs radii that are not there, or names a body that is not there.
+        """
+        for barrier in self.barriers:
+            barrier.require_radii(radius)
+        return [
+            barrier.build_unknown(radius)
+            if isinstance(barrier, AvoidanceConfig) and barrier.is_unknown
+            else barrier.build(bodies)
+            for barrier in self.barriers
+        ]
 
     @property
     def neighbour_velocities(self) -> frozenset[str]:
@@ -106,26 +133,26 @@ class ObserveConfig(Strict):
         return robots
 
     def build_observer(
-        self, task: Task, barriers: Sequence[Barrier], robots: int
-    ) -> SetMembershipObserver | HybridObserver:
+        self, task: Task, barriers: Sequence[Barrier | UnknownAvoidance], robots: int
+    ) -> SetMembershipObserver | SafetyObserver | HybridObserver:
         """The observer of this number of robots: sets, with the filter beside them unless `ukf` is False.
 
         Raises:
             ConfigError: `noise.velocity` is `auto`, and the bound has not been determined yet.
         """
         from torchfsid.observers.hybrid import HybridObserver
+        from torchfsid.observers.safety import SafetyObserver
         from torchfsid.observers.set_membership import SetMembershipObserver
 
-        sets = SetMembershipObserver(
-            task,
-            barriers,
-            self.prior.build(robots),
-            kind=self.set,
-            noise=self.noise.build(),
-            active_tolerance=self.active_tolerance,
-            on_inconsistent=self.on_inconsistent,
-        )
+        prior, noise, tolerance = self.prior.build(robots), self.noise.build(), self.active_tolerance
+        sets: SetMembershipObserver | SafetyObserver
+        if self.is_unknown:
+            sets = SafetyObserver(task, barriers, prior, noise, tolerance, self.on_inconsistent)
+            known = sets.present_barriers
+        else:
+            known = [barrier for barrier in barriers if callable(barrier)]
+            sets = SetMembershipObserver(task, known, prior, self.set, noise, tolerance, self.on_inconsistent)
         if self.ukf is False:
             return sets
-        ukf = self.ukf.build(task, barriers, self.prior, robots, self.active_tolerance)
+        ukf = self.ukf.build(task, known, self.prior, robots, self.active_tolerance)
         return HybridObserver(sets, ukf, feedback=self.ukf.feedback)

@@ -7,7 +7,7 @@ import reprlib
 from collections.abc import Sequence
 from typing import Annotated
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Discriminator, Field, Tag
 
 from torchfsid.config.documents import wrong
 from torchfsid.errors import ConfigError
@@ -44,6 +44,23 @@ Vector = Annotated[tuple[Number, ...], Field(min_length=1)]
 PlanarVector = Annotated[tuple[Number, ...], Field(min_length=2, max_length=2)]
 
 
+def _one_or_two(value: object) -> str:
+    return "<interval>" if isinstance(value, list | tuple) else "<number>"
+
+
+PositiveInterval = Annotated[tuple[Positive, ...], Field(min_length=2, max_length=2)]
+Unknown = Discriminator(_one_or_two)
+PositiveOrInterval = Annotated[
+    Annotated[Positive, Tag("<number>")] | Annotated[PositiveInterval, Tag("<interval>")], Unknown
+]
+"""A number, or bounds [low, high] on a number that is not known."""
+
+NonNegativeOrInterval = Annotated[
+    Annotated[NonNegative, Tag("<number>")] | Annotated[PlanarVector, Tag("<interval>")], Unknown
+]
+"""A number >= 0, or bounds [low, high] on one that is not known."""
+
+
 def require_body(path: str, name: str, bodies: Sequence[str]) -> None:
     """Check that a body named in the file is in the log.
 
@@ -57,6 +74,23 @@ def require_body(path: str, name: str, bodies: Sequence[str]) -> None:
     """
     if name not in bodies:
         raise ConfigError(f"{path}: no body is called {name!r}; there are {reprlib.repr(list(bodies))}")
+
+
+def as_interval(value: float | tuple[float, ...]) -> tuple[float, float]:
+    """The interval [low, high], or that of a known number."""
+    return (value[0], value[1]) if isinstance(value, tuple) else (value, value)
+
+
+def known(value: float | tuple[float, ...] | None) -> float | None:
+    """A number that must be known by now."""
+    assert not isinstance(value, tuple)
+    return value
+
+
+def require_interval(name: str, value: float | tuple[float, ...] | None) -> None:
+    """Check, in a validator, that an interval has low <= high."""
+    if isinstance(value, tuple) and not value[0] <= value[1]:
+        raise wrong(f"expected [low, high] with low <= high, got {list(value)}", name)
 
 
 def require_box(lower: Sequence[float], upper: Sequence[float]) -> None:

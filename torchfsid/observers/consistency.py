@@ -8,7 +8,8 @@ smallest bound for that sample alone, with a given Theta in place of the prior.
 
 Unlike an observer, this reads the whole log. Blocks of samples are read at once with the current Theta. They are read
 again while that shrinks Theta, which is possible if the nominal control is clipped. So the sets are never larger than
-the observer's. An observer with bound delta_i finds no contradiction, up to round-off.
+the observer's. An observer with bound delta_i finds no contradiction, up to round-off. Where safety parameters are
+unknown, every robot has a set Psi of its own beside its Theta.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -23,10 +25,12 @@ from torch import Tensor
 
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.identification.evidence import Evidence, ObservationModel, evidence
+from torchfsid.identification.safety_parameters import LearningModel, Possible
 from torchfsid.robots.barriers import Barrier
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.tasks import Task
+from torchfsid.robots.unknown_avoidance import UnknownAvoidance
 from torchfsid.sets.feasible_set import FeasibleSet
 
 RESOLUTION = 1.02
@@ -49,6 +53,11 @@ class Block:
     times: Float[Tensor, "samples"]
     measurement: Measurement
 
+    @property
+    def of_items(self) -> Float[Tensor, "items"]:
+        """The time of each item, a robot's sample [s]."""
+        return torch.as_tensor(self.measurement.t, dtype=torch.float64)
+
     @classmethod
     def of(cls, samples: Sequence[Measurement]) -> Block:
         return cls(
@@ -58,6 +67,14 @@ class Block:
     def repeated(self, of_robots: Tensor) -> Tensor:
         """The values `of_robots`, repeated for each sample of the block."""
         return of_robots.repeat(len(self.times), *[1] * (of_robots.ndim - 1))
+
+
+class Fit(NamedTuple):
+    """Theta of every robot, its Psi if safety parameters are unknown, and whether they are free of contradictions."""
+
+    theta: FeasibleSet
+    psi: FeasibleSet | None
+    fits: Bool[Tensor, "B"]
 
 
 class Consistency:
@@ -77,7 +94,7 @@ class Consistency:
         self,
         measurements: Sequence[Measurement],
         task: Task,
-        barriers: Sequence[Barrier],
+        barriers: Sequence[Barrier | UnknownAvoidance],
         prior: FeasibleSet,
         slack: float | None = None,
         position: float = 0.0,
@@ -86,47 +103,55 @@ class Consistency:
         self.task, self.barriers, self.prior, self.slack = task, barriers, prior, slack
         self.position, self.neighbour_velocity = position, neighbour_velocity
         self.robots = prior.batch_shape[0]
+        unknown = [barrier for barrier in barriers if isinstance(barrier, UnknownAvoidance)]
+        self.psi = unknown[0].prior(self.robots) if unknown else None
         self.blocks = [Block.of(measurements[k : k + BLOCK]) for k in range(0, len(measurements), BLOCK)]
         self.fastest = max(float(sample.u.norm(dim=-1).max()) for sample in measurements if sample.u is not None)
 
     def smallest_bounds(self, largest: float) -> Float[Tensor, "B"]:
         """delta_i of every robot [m/s], too large by at most `RESOLUTION`. Infinite if it is above `largest`."""
         high = torch.full((self.robots,), largest, dtype=torch.float64)
-        possible = self.sets(high)[1]
+        possible = self.sets(high).fits
         low = torch.full_like(high, min(SMALLEST, largest))
-        high = torch.where(self.sets(low)[1], low, high)
+        high = torch.where(self.sets(low).fits, low, high)
         while bool((high > low * RESOLUTION)[possible].any()):
             middle = (low * high).sqrt()
-            fits = self.sets(middle, possible)[1]
+            fits = self.sets(middle, possible).fits
             low, high = torch.where(fits, low, middle), torch.where(fits, middle, high)
         return torch.where(possible, high, math.inf)
 
-    def sets(
-        self, velocity: Float[Tensor, "B"], wanted: Bool[Tensor, "B"] | None = None
-    ) -> tuple[FeasibleSet, Bool[Tensor, "B"]]:
-        """Theta of every robot for its own velocity bound [m/s], and whether it is free of contradictions.
+    def sets(self, velocity: Float[Tensor, "B"], wanted: Bool[Tensor, "B"] | None = None) -> Fit:
+        """The sets of every robot for its own velocity bound [m/s].
 
         The computation stops as soon as all `wanted` robots (default: all) are contradicted.
         """
         wanted = torch.ones(self.robots, dtype=torch.bool) if wanted is None else wanted
-        theta, fits = self.prior, torch.ones(self.robots, dtype=torch.bool)
+        theta, psi, fits = self.prior, self.psi, torch.ones(self.robots, dtype=torch.bool)
+        rereads = self.task.saturation is not None or psi is not None
         while True:
             before = theta.volume()
             for block in self.blocks:
-                found = self.read(block, theta, block.repeated(velocity))
+                noise = self._noise(block.repeated(velocity))
+                if psi is None:
+                    found = evidence(ObservationModel(self.task, self._known, noise=noise), theta, block.measurement)
+                    narrowed = theta.intersect(self._omega(found))
+                else:
+                    own = Possible(theta, psi, torch.arange(self.robots))
+                    read = LearningModel(self.task, self.barriers, noise).read(own, block.measurement)
+                    found, narrowed = read.evidence, read.theta
+                    learned = read.cuts.apply(psi, own.owner, block.of_items)
+                    fits = fits & ~learned.is_empty
+                    psi = learned.where(~learned.is_empty, psi)
                 if self.slack is None:
                     fits = fits & ~self._by_robot(found.alarmed).any(0)
-                rows = found.omega
-                A, b = self._by_robot(rows.A).transpose(0, 1).flatten(1, 2), self._by_robot(rows.b).transpose(0, 1)
-                narrowed = theta.intersect(Halfspaces(A, b.flatten(1, 2)))
                 fits = fits & ~narrowed.is_empty
                 theta = narrowed.where(~narrowed.is_empty, theta)
                 if not bool((fits & wanted).any()):
-                    return theta, fits
-            if self.task.saturation is None or bool((theta.volume() >= SHRUNK * before)[fits & wanted].all()):
-                return theta, fits
+                    return Fit(theta, psi, fits)
+            if not rereads or bool((theta.volume() >= SHRUNK * before)[fits & wanted].all()):
+                return Fit(theta, psi, fits)
 
-    def residuals(self, theta: FeasibleSet, largest: float) -> Float[Tensor, "samples B"]:
+    def residuals(self, sets: Fit, largest: float) -> Float[Tensor, "samples B"]:
         """The smallest bound with which each sample's own set meets Theta [m/s].
 
         It is NaN where the sample says nothing of theta, and infinite above `largest`.
@@ -136,28 +161,45 @@ class Consistency:
             items = len(block.times) * self.robots
             high = torch.full((items,), largest, dtype=torch.float64)
             low = torch.full_like(high, min(SMALLEST, largest))
-            possible, says = self._meets(block, theta, high)
-            high = torch.where(self._meets(block, theta, low)[0], low, high)
+            possible, says = self._meets(block, sets, high)
+            high = torch.where(self._meets(block, sets, low)[0], low, high)
             while bool((high > low * RESOLUTION)[possible].any()):
                 middle = (low * high).sqrt()
-                meets, _ = self._meets(block, theta, middle)
+                meets, _ = self._meets(block, sets, middle)
                 low, high = torch.where(meets, low, middle), torch.where(meets, middle, high)
             found.append(self._by_robot(torch.where(possible, high, math.inf).where(says, math.nan)))
         return torch.cat(found)
 
-    def read(self, block: Block, theta: FeasibleSet, velocity: Float[Tensor, "items"]) -> Evidence:
-        """The evidence of a block of samples, given Theta and a velocity bound [m/s] for each item."""
+    def read(self, block: Block, sets: Fit, velocity: Float[Tensor, "items"]) -> Evidence:
+        """The evidence of a block of samples, given sets and a velocity bound [m/s] for each item."""
+        noise = self._noise(velocity)
+        if sets.psi is None:
+            model = ObservationModel(self.task, self._known, noise=noise)
+        else:
+            corners = block.repeated(sets.psi.vertices().detach())
+            model = LearningModel(self.task, self.barriers, noise).given(corners)
+        return evidence(model, sets.theta, block.measurement)
+
+    @property
+    def _known(self) -> list[Barrier]:
+        return [barrier for barrier in self.barriers if not isinstance(barrier, UnknownAvoidance)]
+
+    def _noise(self, velocity: Float[Tensor, "items"]) -> NoiseBound:
         slack = None if self.slack is None else torch.full_like(velocity, self.slack)
-        noise = NoiseBound(velocity, slack, self.position, self.neighbour_velocity)
-        return evidence(ObservationModel(self.task, self.barriers, noise=noise), theta, block.measurement)
+        return NoiseBound(velocity, slack, self.position, self.neighbour_velocity)
+
+    def _omega(self, found: Evidence) -> Halfspaces:
+        """The half-spaces of each robot's samples as one set of rows."""
+        A, b = (self._by_robot(part).transpose(0, 1).flatten(1, 2) for part in (found.omega.A, found.omega.b))
+        return Halfspaces(A, b)
 
     def _meets(
-        self, block: Block, theta: FeasibleSet, velocity: Float[Tensor, "items"]
+        self, block: Block, sets: Fit, velocity: Float[Tensor, "items"]
     ) -> tuple[Bool[Tensor, "items"], Bool[Tensor, "items"]]:
         """Does each sample's set meet Theta, and was the sample measured at all?"""
-        found = self.read(block, theta, velocity)
+        found = self.read(block, sets, velocity)
         items = block.repeated(torch.arange(self.robots))
-        meets = ~theta.select(items).intersect(found.omega).is_empty
+        meets = ~sets.theta.select(items).intersect(found.omega).is_empty
         if self.slack is None:
             meets = meets & ~found.alarmed
         return meets, found.informative | found.alarmed

@@ -6,6 +6,8 @@ P is the filter's covariance of theta, so this is the most likely of the possibl
 set reduces, in its own metric, the distance to every point of the set. So it comes closer to the truth if Theta
 contains it. P itself is never cut by the set, because the same set would count as new information at every step.
 
+Where safety parameters are unknown, the filter takes the typical ones of Psi.
+
 The set does not depend on the filter. Where P is no longer a covariance, the projection is Euclidean. Where the
 filter's estimate is not finite, or so far away that its projection has no accurate digits, the centroid of the set
 replaces it. `status` reports both.
@@ -20,7 +22,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchfsid.errors import InputError, SolverError
-from torchfsid.observers.set_membership import SetEstimate, SetMembershipObserver
+from torchfsid.observers.safety import SafetyObserver, SetObserver
+from torchfsid.observers.set_membership import SetEstimate
 from torchfsid.observers.ukf import ParameterUkf, UkfEstimate
 from torchfsid.outcome import HybridStatus
 from torchfsid.robots.measurement import Measurement
@@ -62,7 +65,7 @@ class HybridObserver:
         InputError: the two observers have different robots or parameters.
     """
 
-    sets: SetMembershipObserver
+    sets: SetObserver
     ukf: ParameterUkf
     feedback: bool = False
 
@@ -78,6 +81,8 @@ class HybridObserver:
             InputError: see `SetMembershipObserver.update` and `ParameterUkf.update`.
         """
         set_estimate = self.sets.update(measurement)
+        if isinstance(self.sets, SafetyObserver):
+            self.ukf.barriers = self.sets.present_barriers
         ukf_estimate = self.ukf.update(measurement)
         theta, status = _into(set_estimate.feasible_set, ukf_estimate)
         if self.feedback and bool(theta.isfinite().all()):

@@ -25,7 +25,7 @@ from torchfsid.halfspaces import Halfspaces
 from torchfsid.identification.evidence import SetKind
 from torchfsid.identification.safety_parameters import Cuts, LearningModel, Possible, Reading
 from torchfsid.observers.second_look import MOST_CELLS, second_look
-from torchfsid.observers.set_membership import Event, OnInconsistent, SetEstimate
+from torchfsid.observers.set_membership import Event, OnInconsistent, SetEstimate, SetMembershipObserver
 from torchfsid.outcome import Status
 from torchfsid.robots.barriers import Barrier
 from torchfsid.robots.bounds import NoiseBound
@@ -308,6 +308,10 @@ class SafetyObserver:
         else:
             self.feasible_set, self.safety, self.status, self.skipped = theta, psi, self._status, self._skipped
         self._shown = (theta, psi)
+
+
+SetObserver = SetMembershipObserver | SafetyObserver
+"""An observer of sets, with known or unknown safety parameters."""
 
 
 def _rows(against: Facets, place: int) -> tuple[tuple[float, int], ...]:
