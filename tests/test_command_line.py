@@ -18,7 +18,7 @@ from torchfsid.commands.interruption import uninterrupted
 from torchfsid.commands.results import seconds
 from torchfsid.commands.results_folder import ResultsFolder
 from torchfsid.commands.terminal import digits, status, table, track
-from torchfsid.errors import ConfigError, InconsistentError
+from torchfsid.errors import ConfigError, LogError
 
 
 def fail(error: BaseException) -> Callable[[], None]:
@@ -39,7 +39,7 @@ def answer(capsys: pytest.CaptureFixture[str], action: Callable[[], object], fol
     ("error", "before", "after", "line"),
     [
         (ConfigError("a: wrong"), 2, 1, "prog: a: wrong"),
-        (InconsistentError("empty"), 2, 1, "prog: empty"),
+        (LogError("empty"), 2, 1, "prog: empty"),
         (OSError(errno.EACCES, "Permission denied", "x.csv"), 2, 1, "prog: x.csv: Permission denied"),
         (OSError(errno.ENOSPC, "No space left on device"), 1, 1, "prog: standard output: No space left on device"),
         (MemoryError(), 1, 1, "prog: not enough memory"),

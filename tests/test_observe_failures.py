@@ -259,5 +259,9 @@ def test_raising_on_an_inconsistent_set_is_a_failure_after_the_fact(
     observe: Observe, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert observe(CONFIG, "on_inconsistent=raise", "prior={lower: [3, 3], upper: [4, 4]}") == 1
-    assert "no parameter explains the measurements" in last_line(capsys)
-    assert (tmp_path / "out" / "regions.json").exists()
+    assert last_line(capsys) == (
+        "torchfsid: robot 'ann' at 0 s: no parameter explains the measurements; "
+        "these contradict each other: avoid bob at 0 s, prior"
+    )
+    regions = json.loads((tmp_path / "out" / "regions.json").read_text())["robots"]
+    assert regions["ann"]["status"] == "inconsistent"

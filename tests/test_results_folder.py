@@ -73,7 +73,7 @@ def test_a_subfolder_that_a_run_wrote_is_no_folder_of_its_own(
     (tmp_path / "nest" / "far").mkdir()
     monkeypatch.chdir(tmp_path / "nest" / "far")
     for path in (tmp_path / "nest" / "far", tmp_path / "nest" / "near", Path(".")):
-        with pytest.raises(ConfigError, match="belongs to the results in .*nest; choose another --out$"):
+        with pytest.raises(ConfigError, match=r"belongs to the results in .*nest; choose another --out$"):
             folder(path, kind).claim(["a.csv"])
     other = folder(tmp_path / "nest" / "farther", kind)
     other.claim(["a.csv"])
