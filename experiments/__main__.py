@@ -33,6 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     where.add_argument("--dask", metavar="ADDRESS", help="run on a Dask cluster, tcp://HOST:PORT of its scheduler")
     figures = commands.add_parser("figures", help="draw the figures of a results folder again")
     figures.add_argument("out", type=Path, metavar="DIR", help="results folder of a run")
+    commands.metavar = f"{{{','.join(commands.choices)}}}"  # so that a message about a missing command names them
     chosen = parser.parse_args(arguments)
     folder = ResultsFolder(chosen.out, None)
     left = "what is done so far is in {folder}"

@@ -119,6 +119,8 @@ def load(path: str | Path, overrides: Sequence[str] = (), command: Command | Non
     """
     mapping = read_yaml(path)
     mapping = (override_sweep if mapping.get("kind") == "sweep" else apply_overrides)(mapping, overrides)
+    if "kind" not in mapping and ("task" in mapping or "tasks" in mapping):
+        raise ConfigError(f"{path}: is of `torchfsid observe`, which writes its results and draws regions.png")
     kind, expected = mapping.get("kind"), [name for name, of in KINDS.items() if command in (None, of.command)]
     if kind not in expected:
         raise ConfigError(f"{path}: kind: expected one of {', '.join(map(repr, expected))}, got {kind!r}")

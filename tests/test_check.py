@@ -138,6 +138,31 @@ def test_an_exact_log_of_the_declared_model(crossing: Trajectory, tmp_path: Path
     assert found.conclusions()[0].startswith("the log is consistent with the declared model for velocity >= 1e-09 m/s")
 
 
+def write_rows(path: Path, rows: list[str]) -> Path:
+    path.write_text("\n".join(["t,robot,x,y,vx,vy", *rows]) + "\n")
+    return path
+
+
+def test_a_log_that_says_nothing_is_not_called_consistent(tmp_path: Path) -> None:
+    """A robot that breaks the barrier and does not move: its controller has failed."""
+    log = write_rows(
+        tmp_path / "a.csv", [f"{t},{body},{x},0,0,0" for t in range(6) for body, x in (("a", 0), ("b", 0.3))]
+    )
+    found = check(declared(log, obstacles=["b"]))
+    assert found.to_json()["smallest_bound"] is found.to_json()["robots"]["a"]["smallest_bound"] is None
+    assert found.conclusions() == ["nothing can be said of a: no sample could be used"]
+    assert check(declared(log, obstacles=[])).conclusions() == ["nothing can be said of a, b: no sample could be used"]
+
+
+def test_what_is_said_is_only_said_of_robots_with_samples_and_of_shifts_that_were_tried(tmp_path: Path) -> None:
+    bodies = (("a", 0, 0), ("b", 0.3, 0), ("c", 4, 0.9))
+    rows = [f"{t},{body},{x},0,{vx},0" for t in range(2) for body, x, vx in bodies]
+    conclusions = check(declared(write_rows(tmp_path / "a.csv", rows), obstacles=[])).conclusions()
+    assert conclusions[0] == "nothing can be said of a, b: no sample could be used"
+    assert conclusions[1].startswith("the log is consistent")
+    assert conclusions[2].startswith("nothing can be said of the alignment")
+
+
 def test_a_shift_between_positions_and_velocities_is_found(crossing: Trajectory, tmp_path: Path) -> None:
     """Velocities are logged one sample too late."""
     late = replace(crossing, u=torch.cat([crossing.u[:1], crossing.u[:-1]]))

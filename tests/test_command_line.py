@@ -7,18 +7,21 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
 from rich.console import Console
+from rich.markup import escape
 
+import experiments.__main__
+import torchfsid.cli
 from torchfsid.commands.command_line import execute
 from torchfsid.commands.interruption import uninterrupted
 from torchfsid.commands.results import seconds
 from torchfsid.commands.results_folder import ResultsFolder
-from torchfsid.commands.terminal import digits, status, table, track
-from torchfsid.errors import ConfigError, InconsistentError
+from torchfsid.commands.terminal import aside, console, digits, status, table, track
+from torchfsid.errors import ConfigError, LogError
 
 
 def fail(error: BaseException) -> Callable[[], None]:
@@ -39,7 +42,7 @@ def answer(capsys: pytest.CaptureFixture[str], action: Callable[[], object], fol
     ("error", "before", "after", "line"),
     [
         (ConfigError("a: wrong"), 2, 1, "prog: a: wrong"),
-        (InconsistentError("empty"), 2, 1, "prog: empty"),
+        (LogError("empty"), 2, 1, "prog: empty"),
         (OSError(errno.EACCES, "Permission denied", "x.csv"), 2, 1, "prog: x.csv: Permission denied"),
         (OSError(errno.ENOSPC, "No space left on device"), 1, 1, "prog: standard output: No space left on device"),
         (MemoryError(), 1, 1, "prog: not enough memory"),
@@ -203,10 +206,12 @@ def test_times_since_1970_keep_their_milliseconds() -> None:
 @pytest.mark.parametrize(
     ("value", "resolution", "text"),
     [
-        (1.23456789, 1.0, "1.235"),
+        (1.23456789, 1.0, "1.23"),
+        (0.123456789, 0.3, "0.123"),
         (448262.123456789, 0.002, "448262.1235"),
         (5411932.5, 2e-3, "5411932.5"),
-        (-3.5e-15, 10.0, "-3.5e-15"),
+        (448262.1, 1e3, "4.483e+05"),
+        (-3.5e-15, 10.0, "0"),
         (0.0, 0.0, "0"),
         (2.5, 0.0, "2.5"),
         (1 / 3, 0.0, "0.33333333333333"),
@@ -219,7 +224,7 @@ def test_times_since_1970_keep_their_milliseconds() -> None:
 def test_digits_enough_to_find_a_point_in_its_set(value: float, resolution: float, text: str) -> None:
     assert digits(value, resolution) == text
     if math.isfinite(value) and math.isfinite(resolution):
-        assert abs(float(text) - value) <= max(resolution, 1e-3 * abs(value))
+        assert abs(float(text) - value) <= max(resolution / 10, 1e-12 * abs(value))
 
 
 def test_a_narrow_terminal_shows_every_digit() -> None:
@@ -232,6 +237,28 @@ def test_a_narrow_terminal_shows_every_digit() -> None:
     assert "…" not in text
     for number in ("3.53e-05", "0.0068", "448262.1235", "5411932.123", "0.00333"):
         assert number in text
+
+
+def test_names_and_units_are_shown_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    made = table(":smile: [m/s]", ["robot [m]"], ["worst [m]"])
+    made.add_row(escape(":smile:"), escape("[bold]"))
+    console().print(made)
+    text = capsys.readouterr().out
+    for word in (":smile: [m/s]", "robot [m]", "worst [m]", "│ :smile:", "[bold]"):
+        assert word in text
+    aside().print(":smile:")
+    assert capsys.readouterr().err == ":smile:\n"
+
+
+@pytest.mark.parametrize("main", [torchfsid.cli.main, experiments.__main__.main])
+def test_without_a_command_the_commands_are_named(
+    main: Callable[[Sequence[str]], int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main([])
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "{observe,check}" in error or "{run,sweep,design,figures}" in error
 
 
 @pytest.mark.parametrize("stream", ["stdout", "stderr"])

@@ -290,6 +290,15 @@ def test_run_draws_and_figures_draws_again(tmp_path: Path, capsys: pytest.Captur
     assert {name: (out / name).read_bytes() for name in drawn} == drawn
 
 
+@pytest.mark.parametrize("content", ["task: {kind: velocity}\n", "tasks: []\n"])
+def test_figures_of_an_observed_log_are_drawn_elsewhere(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], content: str
+):
+    (tmp_path / "config.yaml").write_text(content)
+    assert main(["figures", str(tmp_path)]) == 2
+    assert "is of `torchfsid observe`, which" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("scene", "names"),
     [("four_robots", ["figure", "comparison"]), ("five_cases", ["figure"])],

@@ -45,9 +45,9 @@ CHANGES: dict[str, list[Any]] = {
         [{"kind": "speed_polygon", "sides": 3, "limit": 1e-12, "soft": True}],
     ],
     "prior": [
-        {"lower": [-1e12, -1e12], "upper": [1e12, 1e12]},
+        {"lower": [-1e9, -1e9], "upper": [1e9, 1e9]},
         {"lower": [4.0, 4.0], "upper": [4.0000000001, 4.0000000001]},
-        {"lower": [1e15, -1], "upper": [2e15, 1]},
+        {"lower": [5e8, -1], "upper": [1e9, 1]},
     ],
     "noise": [{"velocity": 0}, {"velocity": 1e6}, {"velocity": "auto"}, {"velocity": 1e-3, "position": 10.0}],
     "set": ["critical_region"],

@@ -78,6 +78,7 @@ def test_each_robot_is_identified_by_refuting_the_others(
     assert main(["observe", str(log), "--config", str(config), "--out", str(out)]) == 0
     text = capsys.readouterr().out
     assert "which task is it?" in text
+    assert all(f"│ {body} " in text for body in BODIES)
     verdicts = json.loads((out / "hypotheses.json").read_text())
     assert list(verdicts) == BODIES
     for body, true_name, truth in zip(BODIES, NAMES, TRUTHS.values(), strict=True):

@@ -201,6 +201,25 @@ def test_a_figure_that_fails_is_the_last_thing_said(
     assert goals_are_inside(tmp_path / "out")
 
 
+def test_only_what_this_run_drew_is_listed(
+    observe: Observe, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A folder stands where the figure of an earlier run was. In a second run nothing can be drawn at all."""
+    out = tmp_path / "out"
+    assert observe() == 0
+    assert "regions.png" in capsys.readouterr().out
+    (out / "regions.png").unlink()
+    (out / "regions.png").mkdir()
+    assert observe() == 1
+    assert "regions.png" not in capsys.readouterr().out
+    (out / "regions.png").rmdir()
+    assert observe() == 0
+    capsys.readouterr()
+    monkeypatch.setattr(Figure, "savefig", lambda *arguments, **options: 1 / 0)
+    assert observe() == 1
+    assert "regions.p" not in capsys.readouterr().out
+
+
 def test_sets_of_which_sizes_are_not_known_are_written(
     observe: Observe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -259,5 +278,9 @@ def test_raising_on_an_inconsistent_set_is_a_failure_after_the_fact(
     observe: Observe, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert observe(CONFIG, "on_inconsistent=raise", "prior={lower: [3, 3], upper: [4, 4]}") == 1
-    assert "no parameter explains the measurements" in last_line(capsys)
-    assert (tmp_path / "out" / "regions.json").exists()
+    assert last_line(capsys) == (
+        "torchfsid: robot 'ann' at 0 s: no parameter explains the measurements; "
+        "these contradict each other: avoid bob at 0 s, prior"
+    )
+    regions = json.loads((tmp_path / "out" / "regions.json").read_text())["robots"]
+    assert regions["ann"]["status"] == "inconsistent"

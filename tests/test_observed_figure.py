@@ -6,10 +6,11 @@ import math
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from torchfsid.commands import figures
@@ -31,7 +32,8 @@ def write_results(
     out: Path, robots: Sequence[str], times: int = TIMES, diameter: float | str = 0.5, **region: Any
 ) -> tuple[np.ndarray, np.ndarray, Sequence[str]]:
     """A results folder, and what else a figure takes."""
-    final = {"vertices": [[0, 0], [1, 0], [0, 1]], "centroid": [1 / 3, 1 / 3], "diameter": math.sqrt(2), **region}
+    final = {"vertices": [[0, 0], [1, 0], [0, 1]], "centroid": [1 / 3, 1 / 3], "diameter": math.sqrt(2), "status": "ok"}
+    final |= region
     (out / "regions.json").write_text(json.dumps({"robots": dict.fromkeys(robots, final)}), encoding="utf-8")
     with (out / "estimates.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
@@ -71,9 +73,66 @@ def test_sets_of_every_kind(tmp_path: Path, options: dict[str, Any]) -> None:
     draw(tmp_path, ["a", "b"], **options)
 
 
-def test_long_logs_are_thinned_and_end_where_they_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn: list[Figure] = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, file, format: (drawn.append(figure), file.write(b"x")))
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """The figures that are drawn, laid out but not rendered."""
+    figures: list[Figure] = []
+
+    def lay_out(figure: Figure, file: IO[bytes], **options: object) -> None:
+        figure.draw_without_rendering()
+        figures.append(figure)
+        file.write(b"x")
+
+    monkeypatch.setattr(Figure, "savefig", lay_out)
+    return figures
+
+
+@pytest.mark.parametrize("apart", [0.0, 1.0], ids=["one place", "a line"])
+def test_the_map_of_parked_robots_is_as_wide_as_any(tmp_path: Path, drawn: list[Figure], apart: float) -> None:
+    point = {"vertices": [[1, 1], [1 + 1e-14, 1]], "centroid": [1, 1], "diameter": 1e-14}
+    x, seen, bodies = write_results(tmp_path, ["a", "b"], **point)
+    x[:] = [[1, 1], [1 + apart, 1]]
+    draw_observation(tmp_path, x, seen, bodies)
+    axes = drawn[0].axes[0]
+    assert min(axes.bbox.width, axes.bbox.height) > 0.7 * max(axes.bbox.width, axes.bbox.height)
+    for low, high in (axes.get_xlim(), axes.get_ylim()):
+        assert max(0.01, 0.7 * apart) < high - low < max(0.03, 2 * apart)
+    assert axes.get_xlim()[1] - axes.get_xlim()[0] == pytest.approx(
+        (axes.get_ylim()[1] - axes.get_ylim()[0]) * axes.bbox.width / axes.bbox.height
+    )
+
+
+@pytest.mark.parametrize(("last", "scale"), [(0.5, "linear"), (0.26, "linear"), (0.24, "log"), (0.0, "linear")])
+def test_sizes_are_on_a_logarithmic_scale_where_they_shrink_to_half(
+    tmp_path: Path, drawn: list[Figure], last: float, scale: str
+) -> None:
+    arguments = write_results(tmp_path, ["a"])
+    with (tmp_path / "estimates.csv").open("a") as file:
+        file.write(f"9,a,A,{last}\n")
+    draw_observation(tmp_path, *arguments)
+    sizes = drawn[0].axes[1]
+    assert sizes.get_yscale() == scale
+    assert (sizes.get_ylim()[0] == 0) == (scale == "linear")
+    assert sizes.get_ylim()[1] > 0.5
+
+
+def test_a_set_that_is_not_ok_looks_and_is_called_so(tmp_path: Path, drawn: list[Figure]) -> None:
+    arguments = write_results(tmp_path, ["a", "b", "c"])
+    final = json.loads((tmp_path / "regions.json").read_text())
+    final["robots"]["b"]["status"], final["robots"]["c"]["status"] = "inconsistent", "alarm"
+    (tmp_path / "regions.json").write_text(json.dumps(final))
+    draw_observation(tmp_path, *arguments)
+    axes = drawn[0].axes[0]
+    fills = [to_rgb(patch.get_facecolor()) for patch in axes.patches if patch.get_facecolor()[3] > 0]
+    assert fills == [to_rgb(figures.ROBOT_COLOURS[0]), (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)]
+    edges = [patch.get_linestyle() for patch in axes.patches if patch.get_edgecolor()[3] > 0]
+    assert edges == ["-", "--", "--"]
+    assert [label.get_text() for label in axes.texts] == ["a: 1.4 m", "b: 1.4 m, inconsistent", "c: 1.4 m, alarm"]
+    boxes = [label.get_window_extent() for label in axes.texts]
+    assert not any(boxes[i].overlaps(boxes[j]) for i in range(3) for j in range(i))
+
+
+def test_long_logs_are_thinned_and_end_where_they_end(tmp_path: Path, drawn: list[Figure]) -> None:
     times = 3 * MOST_POINTS + 1
     x, seen, bodies = write_results(tmp_path, ["a"], times=times)
     draw_observation(tmp_path, x, seen, bodies)

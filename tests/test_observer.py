@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchfsid.errors import InputError
+from torchfsid.errors import InconsistentError, InputError
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.outcome import Status
 from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
@@ -109,6 +109,21 @@ def test_a_contradiction_is_reported_and_the_set_is_kept(crossing: Trajectory) -
     after = watching.update(crossing.measurement(11))
     assert after.status[0] == Status.INCONSISTENT
     assert after.feasible_set.contains(GOALS).all()
+
+
+def test_a_contradiction_raised_says_which_robot_when_and_by_which_rows(crossing: Trajectory) -> None:
+    """The second robot jumps to the opposite control; the exception comes again as often as the contradiction does."""
+    watching = observer(on_inconsistent="raise")
+    first, second, *_ = crossing.measurements()
+    watching.update(first)
+    turned = with_u(second, [second.u[0].tolist(), (-second.u[1]).tolist()])
+    for _ in range(2):
+        with pytest.raises(InconsistentError, match=r"robot 1 at t = 0\.05 s: no parameter .*\(0\.05, ") as found:
+            watching.update(turned)
+        assert (found.value.robot, found.value.t) == (1, 0.05)
+        assert found.value.rows == watching.events[-1].rows
+    assert watching.status.tolist() == [Status.OK, Status.INCONSISTENT]
+    assert len(watching.events) == 1
 
 
 def test_a_broken_hard_row_raises_the_alarm_and_is_not_used(crossing: Trajectory) -> None:

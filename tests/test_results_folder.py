@@ -63,6 +63,23 @@ def test_a_file_that_no_run_left_is_never_replaced(tmp_path: Path, name: str) ->
     assert os.listdir(tmp_path) == [name]
 
 
+@pytest.mark.parametrize("kind", ["observe", None])
+def test_a_subfolder_that_a_run_wrote_is_no_folder_of_its_own(
+    tmp_path: Path, kind: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nest = folder(tmp_path / "nest")
+    nest.claim(["near/a.csv", "far/a.csv"], CONFIG)
+    nest.release()
+    (tmp_path / "nest" / "far").mkdir()
+    monkeypatch.chdir(tmp_path / "nest" / "far")
+    for path in (tmp_path / "nest" / "far", tmp_path / "nest" / "near", Path(".")):
+        with pytest.raises(ConfigError, match=r"belongs to the results in .*nest; choose another --out$"):
+            folder(path, kind).claim(["a.csv"])
+    other = folder(tmp_path / "nest" / "farther", kind)
+    other.claim(["a.csv"])
+    other.release()
+
+
 def test_a_list_cannot_lead_out_of_the_folder(tmp_path: Path) -> None:
     out, other = tmp_path / "out", tmp_path / "other.txt"
     other.write_text("keep")

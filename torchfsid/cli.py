@@ -31,6 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         add_overrides(command)
     observe.add_argument("--out", type=Path, required=True, help="results folder")
     check.add_argument("--out", type=Path, help="folder for check.json")
+    commands.metavar = f"{{{','.join(commands.choices)}}}"  # so that a message about a missing command names them
     chosen = parser.parse_args(arguments)
 
     if chosen.command == "observe":

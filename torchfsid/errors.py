@@ -26,7 +26,21 @@ class LogError(FsidError):
 
 
 class InconsistentError(FsidError):
-    """No parameter explains the measurements, and the observer was told to raise an exception in this case."""
+    """No parameter explains the measurements, and the observer was told to raise an exception in this case.
+
+    Attributes:
+        robot: index of the robot.
+        t: time [s].
+        rows: the half-spaces that contradict each other, each as (time, source), as in `Event`.
+    """
+
+    def __init__(self, robot: int, t: float, rows: tuple[tuple[float, int], ...]):
+        named = ", ".join(dict.fromkeys(f"({time:.15g}, {source})" for time, source in rows))
+        super().__init__(
+            f"robot {robot} at t = {t:.15g} s: no parameter explains the measurements; "
+            f"these rows contradict each other, as (time, source): {named}"
+        )
+        self.robot, self.t, self.rows = robot, t, rows
 
 
 class SolverError(FsidError):

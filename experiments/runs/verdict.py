@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 
 from experiments.tables import table
 
@@ -25,7 +26,7 @@ ESTIMATORS = {
 def print_verdict(summary: dict[str, Any], console: Console) -> None:
     """Print the summary of a scene."""
     for robot, intervals in summary["timeline"].items():
-        console.print(f"{robot}: " + "; ".join(map(_interval, intervals)), highlight=False)
+        console.print(escape(f"{robot}: " + "; ".join(map(_interval, intervals))), highlight=False)
     if "expected_timeline" in summary:
         console.print(f"Farthest from the expected timeline: {summary['expected_timeline']['deviation']:.3g} s")
     console.print(f"{summary['steps']} steps per robot, of which")
@@ -34,16 +35,18 @@ def print_verdict(summary: dict[str, Any], console: Console) -> None:
         console.print(f"  {promise}: {counts}", highlight=False)
     console.print("From when on lengths are below 10 % / 1 % of the prior's \\[s]:")
     robots = list(summary["timeline"])
-    shown = table([""], robots)
+    shown = table([""], [escape(robot) for robot in robots])
     for name, label in ESTIMATORS.items():
         of_shares = [summary["time_below"][share][name] for share in ("10%", "1%")]
         shown.add_row(label, *(" / ".join(_time(of[robot]) for of in of_shares) for robot in robots))
     console.print(shown)
     for robot in robots:
         if summary["infeasible_steps"][robot]:
-            console.print(f"[red]{robot}: {summary['infeasible_steps'][robot]} steps without a feasible control")
+            console.print(
+                f"[red]{escape(robot)}: {summary['infeasible_steps'][robot]} steps without a feasible control"
+            )
         if summary["deadlocked_since"][robot] is not None:
-            console.print(f"[red]{robot}: in deadlock since {summary['deadlocked_since'][robot]:.2f} s")
+            console.print(f"[red]{escape(robot)}: in deadlock since {summary['deadlocked_since'][robot]:.2f} s")
 
 
 def _interval(interval: dict[str, Any]) -> str:

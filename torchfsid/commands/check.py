@@ -54,7 +54,7 @@ class RobotCheck:
 
     Attributes:
         robot: name of the robot.
-        smallest_bound: the smallest velocity bound that explains the motion [m/s].
+        smallest_bound: the smallest velocity bound that explains the motion [m/s]. NaN if no sample could be used.
         median: median of the residuals of the samples [m/s].
         p95: 95th percentile of the residuals [m/s].
         worst: largest residual [m/s].
@@ -96,8 +96,8 @@ class Check:
 
     @property
     def smallest_bound(self) -> float:
-        """The largest of the robots' smallest bounds [m/s]."""
-        return max(robot.smallest_bound for robot in self.robots)
+        """The largest of the robots' smallest bounds [m/s]. NaN if no sample could be used."""
+        return max((robot.smallest_bound for robot in self.robots if robot.samples), default=math.nan)
 
     @property
     def best_shift(self) -> int:
@@ -107,8 +107,14 @@ class Check:
 
     def conclusions(self) -> list[str]:
         """The conclusions as sentences, with remedies."""
-        lines = [self._fit()]
-        if self.best_shift:
+        silent = [robot.robot for robot in self.robots if robot.samples == 0]
+        lines = [f"nothing can be said of {', '.join(silent)}: no sample could be used"] if silent else []
+        if len(silent) == len(self.robots):
+            return lines
+        lines.append(self._fit())
+        if len(self.shifts) == 1:
+            lines.append("nothing can be said of the alignment of velocities and positions: the log is too short")
+        elif self.best_shift:
             later = "later" if self.best_shift > 0 else "earlier"
             lines.append(
                 f"velocities logged {abs(self.best_shift)} sample(s) {later} fit better: "
@@ -200,17 +206,17 @@ def check(declared: DeclaredLog) -> Check:
     for i, robot in enumerate(declared.robots):
         of_robot = residuals[:, i]
         says = ~of_robot.isnan()
-        some = of_robot[says]
+        some, samples = of_robot[says], int((says | faults.measured[:, i]).sum())
         k = int(of_robot.nan_to_num(nan=-1.0, posinf=math.inf).argmax())
         robots.append(
             RobotCheck(
                 robot=robot,
-                smallest_bound=float(bounds[i]),
+                smallest_bound=float(bounds[i]) if samples else math.nan,
                 median=_quantile(some, 0.5),
                 p95=_quantile(some, 0.95),
                 worst=_quantile(some, 1.0),
                 worst_time=float(declared.log.t[k]) if len(some) else math.nan,
-                samples=len(some),
+                samples=samples,
                 contradictions=faults.contradictions(i),
                 violations=faults.violations(i),
             )

@@ -7,7 +7,7 @@ import io
 import json
 import math
 import warnings
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -46,6 +46,9 @@ MOST_POINTS = 2000
 
 MOST_NAMED = 24
 """Robots beyond which a legend names none."""
+
+NARROWEST = 0.01
+"""Least width of the map [m], where parked robots and their sets are points. Robots themselves are larger."""
 
 WIDE_FONTS = (
     "Noto Sans CJK JP",
@@ -104,7 +107,7 @@ def _regions(path: Path) -> dict[str, Any]:
     """The robots' final sets."""
     try:
         robots = json.loads(path.read_text(encoding="utf-8"))["robots"]
-        needed = ("vertices", "centroid", "diameter")
+        needed = ("vertices", "centroid", "diameter", "status")
         return {robot: {name: region[name] for name in needed} for robot, region in robots.items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise FigureError(f"{path}: missing or damaged: {one_line(error)}") from error
@@ -166,21 +169,28 @@ def _draw_map(axes: Axes, final: dict, x: np.ndarray, seen: np.ndarray, bodies: 
         axes.plot(*path.T, color=colour, lw=1.2, alpha=0.8)
         axes.plot(*path[0], "o", color=colour, ms=4, mfc="white")
         axes.plot(*path[-1], "o", color=colour, ms=6)
+    labels: Counter[tuple[float, ...]] = Counter()
     for i, (robot, region) in enumerate(final.items()):
         if len(region["centroid"]) != 2 or None in region["centroid"]:  # not planar, or empty
             continue
         vertices = np.array(region["vertices"])
-        axes.fill(*vertices.T, facecolor=_colour(i), edgecolor=_colour(i), alpha=0.3, lw=1.2)
+        is_ok = region["status"] == "ok"
+        axes.fill(*vertices.T, facecolor=_colour(i) if is_ok else "0.5", edgecolor="none", alpha=0.3 if is_ok else 0.15)
+        axes.fill(*vertices.T, facecolor="none", edgecolor=_colour(i), alpha=0.6, lw=1.2, ls="-" if is_ok else "--")
         axes.plot(*region["centroid"], "+", color=_colour(i), ms=11, mew=1.6)
         axes.annotate(
-            f"{_plain(robot)}: {region['diameter']:.2g} m",
+            f"{_plain(robot)}: {region['diameter']:.2g} m" + ("" if is_ok else f", {region['status']}"),
             region["centroid"],
             textcoords="offset points",
-            xytext=(7, 7),
+            xytext=(7, 7 - 12 * labels[tuple(region["centroid"])]),
             color=_colour(i),
         )
-    axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title="Final regions, centroids, diameters")
+        labels[tuple(region["centroid"])] += 1  # sets that were never cut have the same centroid
+    axes.set(xlabel="x [m]", ylabel="y [m]", title="Final regions, centroids, diameters")
+    axes.set_aspect("equal", adjustable="datalim")  # the map fills its place, however flat the data
     axes.margins(0.18)
+    left, low = axes.dataLim.x0, axes.dataLim.y0
+    axes.update_datalim([(left - NARROWEST / 2, low), (left + NARROWEST / 2, low)])
     axes.grid(color="0.93", lw=0.6)
     axes.set_axisbelow(True)
 
@@ -188,8 +198,12 @@ def _draw_map(axes: Axes, final: dict, x: np.ndarray, seen: np.ndarray, bodies: 
 def _draw_sizes(axes: Axes, history: dict[str, dict[str, np.ndarray]]) -> None:
     for i, (robot, of) in enumerate(history.items()):
         axes.plot(_thinned(of["t"]), _thinned(of["diameter"]), color=_colour(i), lw=1.5, label=_plain(robot))
-    if any((of["diameter"] > 0).any() for of in history.values()):  # false if all sets are points
+    sizes = np.concatenate([of["diameter"] for of in history.values()])
+    sizes = sizes[sizes > 0]
+    if len(sizes) and sizes.max() > 2 * sizes.min():
         axes.set_yscale("log")
+    else:
+        axes.set_ylim(0, 1.1 * sizes.max() if len(sizes) else None)
     axes.set(ylabel="diameter [m]", title="Size of the region")
     axes.grid(color="0.93", lw=0.6)
     axes.tick_params(labelbottom=False)

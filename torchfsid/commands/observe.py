@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -10,8 +11,9 @@ from pathlib import Path
 import torch
 
 from torchfsid.commands.declared_log import AUTO_FACTOR, DeclaredLog, automatic_bound
-from torchfsid.commands.results import STATUS_NAMES, ResultsWriter, of_sets
+from torchfsid.commands.results import STATUS_NAMES, ResultsWriter, constraint_name, of_sets, seconds
 from torchfsid.config.observe import ObserveConfig
+from torchfsid.errors import FsidError, InconsistentError
 from torchfsid.identification.kkt import CASES
 from torchfsid.logs.log import Log
 from torchfsid.observers.hybrid import HybridObserver
@@ -129,17 +131,33 @@ class Observation:
         """Observe the whole log. Write estimates.csv and regions.json into the existing folder `out`.
 
         Raises:
+            FsidError: no parameter explains a robot, and `on_inconsistent` is `raise`. It names robot and rows.
             OSError: a file could not be written. The log was still observed to its end.
         """
         with ResultsWriter(out, self.robots, self.sets) as results:
             for measurement in track(self.declared.measurements()):
-                estimate = self.observer.update(measurement)
+                try:
+                    estimate = self.observer.update(measurement)
+                except InconsistentError as error:
+                    raise FsidError(self._named(error)) from error
                 results.write(measurement, estimate)
                 sets = of_sets(estimate)
                 for robot, case, used in zip(
                     self.robots, sets.kkt.case.tolist(), sets.informative.tolist(), strict=True
                 ):
                     self._cases[robot].update([CASES[case]] if used else [])
+
+    def _named(self, error: InconsistentError) -> str:
+        """The error with the names of robot and rows."""
+        labels = self.declared.row_labels
+        rows = [
+            constraint_name(source, labels) + ("" if math.isnan(time) else f" at {seconds(time)}")
+            for time, source in error.rows
+        ]
+        return (
+            f"robot {self.robots[error.robot]!r} at {seconds(error.t)}: no parameter explains the measurements; "
+            f"these contradict each other: {', '.join(dict.fromkeys(rows))}"
+        )
 
     def verdicts(self) -> list[Verdict]:
         """The present verdict on each robot."""

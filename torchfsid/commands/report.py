@@ -46,14 +46,16 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
             f"{escape(', '.join(strained))}: if the errors are not that large, the model is wrong (torchfsid check)"
         )
     files = ("estimates.csv", "regions.json", "config.yaml", "regions.png", "regions.pdf")
-    there = ", ".join(file for file in files if (out / file).exists())
+    there = ", ".join(file for file in files if (out / file).is_file())
     console.print(escape(f"Results: {out}/{there}"))
 
 
 def print_hypotheses(hypotheses: Hypotheses, out: Path, console: Console) -> None:
     """Print which hypotheses are left for each robot, and what refuted the others."""
     names = list(hypotheses.observations)
-    verdicts = table("which task is it?", ["robot", *names, "left"])
+    verdicts = table("which task is it?", ["robot"], [*names, "left"])
+    for column in verdicts.columns[1:]:
+        column.justify = "left"
     for robot, of_robot in hypotheses.verdicts().items():
         cells, left = [], []
         for name in names:

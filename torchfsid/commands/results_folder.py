@@ -3,7 +3,7 @@
 A folder belongs to the kind of command whose config.yaml it holds: `observe`, or the `kind` of an experiment. The file
 `.torchfsid` lists the names of the files written there, one a line. The next run of the same kind removes exactly these
 files. If a file that is to be written exists and is not listed, it is somebody else's, and the folder is refused.
-`.torchfsid` is locked while a command writes.
+`.torchfsid` is locked while a command writes. A subfolder that a run wrote belongs to that run: it is no --out.
 """
 
 from __future__ import annotations
@@ -53,10 +53,14 @@ class ResultsFolder:
         """Check that the folder may be used. This is quick, so it comes before any work.
 
         Raises:
-            ConfigError: `path` is not a folder, or holds the results of another kind of command.
+            ConfigError: `path` is not a folder, is a subfolder that a run wrote, or holds the results of another kind
+                of command.
         """
         if self.path.exists() and not self.path.is_dir():
             raise ConfigError(f"--out: {self.path} is not a folder")
+        whole = self.path.resolve()
+        if any(name.startswith(f"{whole.name}/") for name in _listed(whole.parent / MANIFEST)):
+            raise ConfigError(f"{self.path}: belongs to the results in {whole.parent}; choose another --out")
         held = self._kind_held()
         if self.kind is not None and held not in (None, self.kind):
             what = f"the results of '{held}'" if held else "a config.yaml that is not of a run"
@@ -85,8 +89,7 @@ class ResultsFolder:
             self.require_ours()
             if resume and config is not None and _text(self.path / "config.yaml") not in (None, config):
                 raise ConfigError(f"{self.path}: holds another {self.kind}; choose another --out, or remove it")
-            lock.seek(0)
-            listed = lock.read().decode(errors="replace").splitlines()
+            listed = _listed(manifest)
             foreign = [name for name in names if name not in listed and (self.path / name).exists()]
             if foreign and not resume:
                 raise ConfigError(f"{self.path}: {foreign[0]} is there, and no run left it; choose another --out")
@@ -194,6 +197,11 @@ def _lock(file: BinaryIO, folder: Path) -> None:
         raise ConfigError(f"{folder}: another command is writing there") from error
     except OSError:  # a file system without locks
         return
+
+
+def _listed(manifest: Path) -> list[str]:
+    """The names of the files that the runs in a folder wrote."""
+    return manifest.read_text(encoding="utf-8", errors="replace").splitlines() if manifest.exists() else []
 
 
 def _text(path: Path) -> str | None:

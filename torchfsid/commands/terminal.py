@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import IO, Any, TypeVar, cast
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -52,23 +53,23 @@ class _Aside:
 
 def console(least_width: int = 0) -> Console:
     """A console on stdout. Tables that need more columns than the terminal has are wrapped by the terminal."""
-    made = _Console()
+    made = _Console(emoji=False)
     made.width = max(made.width if made.is_terminal else WIDTH, least_width)
     return made
 
 
 def aside() -> Console:
     """A console on stderr."""
-    return Console(file=cast(IO[str], _Aside()))
+    return Console(file=cast(IO[str], _Aside()), emoji=False)
 
 
 def table(title: str, texts: Sequence[str], numbers: Sequence[str] = ()) -> Table:
     """A table with columns of texts, then of numbers. Cells wrap in a narrow terminal, and no digit is cut off."""
-    made = Table(title=title, title_justify="left")
+    made = Table(title=escape(title), title_justify="left")
     for heading in texts:
-        made.add_column(heading, no_wrap=True)
+        made.add_column(escape(heading), no_wrap=True)
     for heading in numbers:
-        made.add_column(heading, justify="right", overflow="fold")
+        made.add_column(escape(heading), justify="right", overflow="fold")
     return made
 
 
@@ -108,9 +109,9 @@ def status(what: str, computes: bool = False) -> Iterator[None]:
 
 
 def digits(value: float, resolution: float) -> str:
-    """A number as text, with at least four digits, and enough to show differences of a tenth of `resolution`.
+    """A number as text: rounded to about a hundredth of `resolution`, so that differences of a tenth of it are seen.
 
-    NaN is a dash.
+    Without a resolution it has four digits. NaN is a dash.
     """
     if math.isnan(value):
         return "-"
@@ -118,6 +119,7 @@ def digits(value: float, resolution: float) -> str:
     if 0 < size < math.inf and math.isfinite(resolution):
         resolution = max(resolution, 1e-12 * size)  # beyond that, digits are round-off
         enough = max(4, 2 + math.floor(math.log10(size)) - math.floor(math.log10(resolution)))
+        value = round(value, 2 - math.floor(math.log10(resolution))) + 0.0  # no -0
     return f"{value:.{enough}g}"
 
 

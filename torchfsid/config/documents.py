@@ -9,9 +9,9 @@ from __future__ import annotations
 import difflib
 import re
 import reprlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
@@ -35,10 +35,19 @@ class Strict(BaseModel):
     def _knows_its_keys(cls, data: Any) -> Any:
         for key in data if isinstance(data, Mapping) else ():
             if key not in cls.model_fields:
-                guess = difflib.get_close_matches(str(key), cls.model_fields, n=1)
+                guess = [f"{section}.{key}" for section, keys in cls._sections() if key in keys]
+                guess += difflib.get_close_matches(str(key), cls.model_fields, n=1)
                 hint = f"did you mean '{guess[0]}'?" if guess else f"known keys: {', '.join(cls.model_fields)}"
                 raise wrong(f"unknown key ({hint})", key)
         return data
+
+    @classmethod
+    def _sections(cls) -> Iterator[tuple[str, Iterable[str]]]:
+        """The keys that are sections of their own, each with its keys."""
+        for name, field in cls.model_fields.items():
+            for part in (field.annotation, *get_args(field.annotation)):
+                if isinstance(part, type) and issubclass(part, Strict):
+                    yield name, part.model_fields
 
 
 Config = TypeVar("Config", bound=Strict)

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from torchfsid.sets.feasible_set import FeasibleSet
 
 
-FARTHEST = 1e100
-"""A prior that reaches further is unbounded in disguise: squares of its numbers would overflow."""
+FARTHEST = 1e9
+"""The furthest that a prior may reach, in the units of theta. Doubles have 16 digits: from here, sets keep 1e-7."""
 
 
 class PriorConfig(Strict):
@@ -40,7 +40,11 @@ class PriorConfig(Strict):
         require_box(self.lower, self.upper)
         for name, corner in (("lower", self.lower), ("upper", self.upper)):
             if max(map(abs, corner)) > FARTHEST:
-                raise wrong(f"expected a bounded set, no number beyond {FARTHEST:g}, got {list(corner)}", name)
+                raise wrong(
+                    f"expected no number beyond {FARTHEST:g}, because sets in a larger prior lose their digits, "
+                    f"got {list(corner)}",
+                    name,
+                )
         return self
 
     def build(self, robots: int) -> FeasibleSet:
