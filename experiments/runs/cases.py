@@ -26,6 +26,7 @@ from experiments.runs.observers import Observers
 from experiments.runs.recording import Recording
 from experiments.runs.saved import Results
 from experiments.runs.table import measure_cases
+from torchfsid.config.quantities import known
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.simulation import closed_loop

@@ -17,7 +17,7 @@ from torchfsid.errors import FsidError, InconsistentError
 from torchfsid.identification.kkt import CASES
 from torchfsid.logs.log import Log
 from torchfsid.observers.hybrid import HybridObserver
-from torchfsid.observers.safety import SetObserver
+from torchfsid.observers.safety import SafetyObserver, SetObserver
 from torchfsid.outcome import Status
 from torchfsid.robots.measurement import Measurement
 
@@ -130,11 +130,13 @@ class Observation:
     def run(self, out: Path, track: Track = iter) -> None:
         """Observe the whole log. Write estimates.csv and regions.json into the existing folder `out`.
 
+        With unknown safety parameters the log is then read again (`second_look`), for the sets of regions.json.
+
         Raises:
             FsidError: no parameter explains a robot, and `on_inconsistent` is `raise`. It names robot and rows.
             OSError: a file could not be written. The log was still observed to its end.
         """
-        with ResultsWriter(out, self.robots, self.sets) as results:
+        with ResultsWriter(out, self.robots, self.sets, labels=self.declared.row_labels) as results:
             for measurement in track(self.declared.measurements()):
                 try:
                     estimate = self.observer.update(measurement)
@@ -146,6 +148,8 @@ class Observation:
                     self.robots, sets.kkt.case.tolist(), sets.informative.tolist(), strict=True
                 ):
                     self._cases[robot].update([CASES[case]] if used else [])
+            if isinstance(self.sets, SafetyObserver):
+                self.sets.look_again(list(self.declared.measurements()))
 
     def _named(self, error: InconsistentError) -> str:
         """The error with the names of robot and rows."""

@@ -14,6 +14,7 @@ from torchfsid.commands.hypotheses import Hypotheses, HypothesisVerdict
 from torchfsid.commands.observe import Observation, Verdict
 from torchfsid.commands.results import seconds
 from torchfsid.commands.terminal import digits, table
+from torchfsid.observers.safety import SafetyObserver
 
 
 def print_verdicts(observation: Observation, out: Path, console: Console) -> None:
@@ -39,6 +40,8 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
             _status(verdict.status) + resets,
         )
     console.print(verdicts)
+    if isinstance(observation.sets, SafetyObserver):
+        _print_safety(observation.sets, observation.robots, observation.declared.row_labels, console)
     _print_bound(console, observation.smallest_bounds, observation.velocity_bound)
     if strained := observation.strained():
         console.print(
@@ -48,6 +51,42 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
     files = ("estimates.csv", "regions.json", "config.yaml", "regions.png", "regions.pdf")
     there = ", ".join(file for file in files if (out / file).is_file())
     console.print(escape(f"Results: {out}/{there}"))
+
+
+def _print_safety(observer: SafetyObserver, robots: Sequence[str], labels: Sequence[str], console: Console) -> None:
+    """Print what was learned about the safety parameters, of the team or of each robot."""
+    unknown = observer.model.unknown
+    what = "safety distance" if unknown.margin is None else "margin"
+    shown = table("safety parameters", ["of"], ["gain", f"{what} \\[m]"])
+    intervals, (of_gain, of_distance) = unknown.intervals(observer.safety), unknown.bounded_by_data(observer.safety)
+    for i, name in enumerate(["the team"] if observer.is_shared else robots):
+        gain = _interval(intervals.gain[i].tolist(), of_gain[i].tolist())
+        shown.add_row(escape(name), gain, _interval(intervals.distance[i].tolist(), of_distance[i].tolist()))
+    console.print(shown)
+    if not bool(of_gain.all() & of_distance.all()):
+        console.print("* not bounded by the data: this end holds only because of the declared interval")
+    for refutation in observer.refutations:
+        rows = dict.fromkeys(
+            f"{robots[robot]} {labels[row]} at {seconds(time)}" for time, robot, row in refutation.rows
+        )
+        rows.update(dict.fromkeys(f"the motion of {robots[robot]}" for robot in refutation.unexplained))
+        whose = (
+            "the team has no safety parameters in common"
+            if refutation.robot is None
+            else (f"no safety parameters explain {robots[refutation.robot]}")
+        )
+        against = f"; these contradict each other: {', '.join(rows)}" if rows else ""
+        console.print(escape(f"{whose}, found at {seconds(refutation.t)}{against}"), soft_wrap=True)
+    if odd := [robots[robot] for robot in observer.odd()]:
+        names = odd[0] if len(odd) == 1 else f"one of {', '.join(odd)}"
+        console.print(escape(f"without {names} the others can have the same parameters"))
+
+
+def _interval(ends: Sequence[float], by_data: Sequence[bool]) -> str:
+    """The interval as text, with a star at the ends that only the prior bounds."""
+    width = ends[1] - ends[0]
+    low, high = (digits(end, width) + ("" if known else "*") for end, known in zip(ends, by_data, strict=True))
+    return f"{low} .. {high}"
 
 
 def print_hypotheses(hypotheses: Hypotheses, out: Path, console: Console) -> None:

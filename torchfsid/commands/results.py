@@ -7,7 +7,8 @@
 Columns of estimates.csv: t, robot, case, n_active, then the set's volume, diameter, centre_i (Chebyshev), radius and
 centroid_i, then ukf_i, hybrid_i, status. Further sets follow with their name as prefix. `case` and `n_active` are empty
 where the robot was not measured. ukf_i and hybrid_i are empty without a filter. Sizes and centres of an empty set are
-empty.
+empty. With unknown safety parameters gain_low, gain_high, distance_low, distance_high come before the status; the
+distance is the declared safety distance or margin.
 """
 
 from __future__ import annotations
@@ -24,8 +25,10 @@ from torch import Tensor
 
 from torchfsid.commands.interruption import uninterrupted
 from torchfsid.commands.results_folder import named, write_json
+from torchfsid.commands.safety_results import COLUMNS, Distances, SafetyColumns, refutation, safety, without_repeats
 from torchfsid.identification.kkt import CASES
 from torchfsid.observers.hybrid import HybridEstimate
+from torchfsid.observers.safety import SafetyObserver, SetObserver
 from torchfsid.observers.set_membership import SetEstimate, SetMembershipObserver
 from torchfsid.outcome import Status
 from torchfsid.robots.measurement import Measurement
@@ -45,16 +48,20 @@ class ResultsWriter:
         robots: names of the inferred robots, in the order of the batch.
         observer: the observer whose final sets go to regions.json.
         others: further observers, by the prefix of their columns.
+        labels: labels of the rows of the model.
     """
 
     def __init__(
         self,
         out: Path,
         robots: Sequence[str],
-        observer: SetMembershipObserver,
+        observer: SetObserver,
         others: Mapping[str, SetMembershipObserver] = MappingProxyType({}),
+        labels: Sequence[str] = (),
     ):
         self.out, self.robots, self.observer, self.others = out, list(robots), observer, others
+        self._labels, self._seen = labels, Distances()
+        self._safety = SafetyColumns(observer) if isinstance(observer, SafetyObserver) else None
         self._described = {name: _Descriptions() for name in ("", *others)}
         self._problem: OSError | None = None
 
@@ -62,7 +69,7 @@ class ResultsWriter:
         self.out.mkdir(parents=True, exist_ok=True)
         p = self.observer.feasible_set.dim
         header = ["t", "robot", "case", "n_active", *set_columns(p), *_indexed("ukf", p), *_indexed("hybrid", p)]
-        header.append("status")
+        header += [*([] if self._safety is None else COLUMNS), "status"]
         for prefix in self.others:
             header += [f"{prefix}_{name}" for name in (*set_columns(p), "status")]
         self._file = (self.out / "estimates.csv").open("wb", buffering=0)
@@ -73,7 +80,7 @@ class ResultsWriter:
         with uninterrupted():
             self._file.close()
             try:
-                write_json(self.out / "regions.json", regions(self.robots, self.observer))
+                write_json(self.out / "regions.json", regions(self.robots, self.observer, self._seen, self._labels))
             except OSError as problem:
                 self._problem = self._problem or problem
         if self._problem is not None:
@@ -96,11 +103,15 @@ class ResultsWriter:
         measured = [True] * len(self.robots) if observed is None else observed.tolist()
         case, n_active, status = sets.kkt.case.tolist(), sets.kkt.n_active.tolist(), sets.status.tolist()
         described, t = self._described[""](sets.feasible_set), _number(float(estimate.t))
+        learned: Sequence[Sequence[str]] = [[]] * len(self.robots)
+        if self._safety is not None and sets.safety is not None:
+            self._seen.see(measurement)
+            learned = self._safety(sets.safety)
         extra = [(self._described[name](other.feasible_set), other.status.tolist()) for name, other in others.items()]
         rows = []
         for i, robot in enumerate(self.robots):
             active = [CASES[case[i]], str(n_active[i])] if measured[i] else ["", ""]
-            row = [t, robot, *active, *described[i], *ukf[i], *hybrid[i], STATUS_NAMES[status[i]]]
+            row = [t, robot, *active, *described[i], *ukf[i], *hybrid[i], *learned[i], STATUS_NAMES[status[i]]]
             for columns, other_status in extra:
                 row += [*columns[i], STATUS_NAMES[other_status[i]]]
             rows.append(row)
@@ -174,7 +185,9 @@ def constraint_name(source: int, labels: Sequence[str]) -> str:
     return labels[source % len(labels)] if source < 2 * len(labels) else "nominal control"
 
 
-def regions(robots: Sequence[str], observer: SetMembershipObserver) -> dict:
+def regions(
+    robots: Sequence[str], observer: SetObserver, seen: Distances | None = None, labels: Sequence[str] = ()
+) -> dict:
     """The content of regions.json: the final sets. NaN is null there.
 
     `last_cut` is NaN if the set never shrank. Sizes and centres are NaN if the set is empty. `facets` says at which
@@ -192,7 +205,7 @@ def regions(robots: Sequence[str], observer: SetMembershipObserver) -> dict:
         of_robots[robot] = {
             "A": rows.A[i][real].tolist(),
             "b": rows.b[i][real].tolist(),
-            "vertices": _without_repeats(vertices[i]).tolist(),
+            "vertices": without_repeats(vertices[i]).tolist(),
             "volume": float(volume[i]),
             "centroid": centroid[i].tolist(),
             "diameter": float(diameter[i]),
@@ -215,14 +228,15 @@ def regions(robots: Sequence[str], observer: SetMembershipObserver) -> dict:
                 for event in events
             ],
         }
-    return {"robots": of_robots}
-
-
-def _without_repeats(vertices: Tensor) -> Tensor:
-    """The vertices without padding, which repeats the first vertex."""
-    repeats = (vertices == vertices[0]).all(-1)
-    repeats[0] = False
-    return vertices[~repeats]
+    if not isinstance(observer, SafetyObserver):
+        return {"robots": of_robots}
+    seen = seen or Distances()
+    for i, robot in enumerate(robots):
+        of_robots[robot]["safety"] = safety(observer, i, seen, robots, labels)
+    whole: dict = {"safety": of_robots[robots[0]]["safety"]} if observer.is_shared else {}
+    whole["refutations"] = [refutation(found, robots, labels) for found in observer.refutations]
+    whole["odd"] = [robots[robot] for robot in observer.odd()]
+    return {"robots": of_robots, **whole}
 
 
 def _indexed(name: str, p: int) -> list[str]:

@@ -250,13 +250,13 @@ class SafetyObserver:
         for item in (alarmed & (self._status < Status.ALARM)).nonzero().flatten().tolist():
             row = int(read.evidence.slack[item].argmin())
             self._events.append(Event(t, item, Status.ALARM, ((t, row),)))
-        against = theta.contradiction
         for item in (lost & (self._status < Status.INCONSISTENT)).nonzero().flatten().tolist():
-            rows = () if not theta.is_empty[item] else _rows(against, item)
-            self._events.append(Event(t, item, Status.INCONSISTENT, rows, reset and bool(theta.is_empty[item])))
-            if self.on_inconsistent == "raise" and not (self.is_shared and item < self.robots):
-                robot = int(self._of[item])
-                raise InconsistentError(f"robot {robot} at t = {t}: no parameters explain the measurements; {rows}")
+            if theta.is_empty[item]:
+                event = Event(t, item, Status.INCONSISTENT, _rows(theta.contradiction, item), reset)
+            else:
+                against = self._named(_rows(psi.contradiction, int(owner[item])))
+                event = Event(t, item, Status.INCONSISTENT, tuple((time, row) for time, _, row in against))
+            self._events.append(event)
         self._refute(t, theta, psi)
         self._status = torch.where(alarmed, self._status.clamp(min=Status.ALARM), self._status)
         contradicted = psi.is_empty[owner] if reset else lost
@@ -264,6 +264,10 @@ class SafetyObserver:
         if reset:
             changed = theta.is_empty.nonzero().flatten()
             self._waiting = [(age, then, c.select(~torch.isin(c.item, changed))) for age, then, c in self._waiting]
+        if self.on_inconsistent == "raise" and bool(lost[-self.robots :].any()):
+            alone = len(self._of) - self.robots
+            event = next(e for e in self._events if e.robot >= alone and e.status == Status.INCONSISTENT)
+            raise InconsistentError(event.robot - alone, t, event.rows)
         instead = self.prior.select(self._of) if reset else self.possible.theta
         return theta.where(~theta.is_empty, instead), psi.where(~psi.is_empty, self.possible.psi)
 
