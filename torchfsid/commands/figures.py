@@ -8,7 +8,7 @@ import json
 import math
 import warnings
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -80,17 +80,30 @@ def draw_observation(out: Path, x: np.ndarray, seen: np.ndarray, bodies: Sequenc
         OSError: a figure cannot be written.
     """
     final, history = _regions(out / "regions.json"), _history(out / "estimates.csv")
-    paths = [out / "regions.png", out / "regions.pdf"]
+
+    def draw(figure: Figure) -> None:
+        grid = figure.add_gridspec(2, 2, width_ratios=(1.25, 1), height_ratios=(2.2, 1))
+        _draw_map(figure.add_subplot(grid[:, 0]), final, x, seen, bodies)
+        size = figure.add_subplot(grid[0, 1])
+        _draw_sizes(size, history)
+        _draw_cases(figure.add_subplot(grid[1, 1], sharex=size), history)
+
+    return render(out / "regions", (10.5, 5.2), draw)
+
+
+def render(name: Path, size: tuple[float, float], draw: Callable[[Figure], None]) -> list[Path]:
+    """Draw a figure of this size [inches] and write it as `name`.png and `name`.pdf.
+
+    Raises:
+        FigureError: matplotlib fails.
+        OSError: a figure cannot be written.
+    """
+    paths, drawn = [name.with_suffix(".png"), name.with_suffix(".pdf")], []
     try:
         with mpl.rc_context({**STYLE, "font.family": _fonts()}), warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="Glyph .* missing from")  # if no font has a glyph, a box is drawn
-            figure = Figure(figsize=(10.5, 5.2), layout="constrained")
-            grid = figure.add_gridspec(2, 2, width_ratios=(1.25, 1), height_ratios=(2.2, 1))
-            _draw_map(figure.add_subplot(grid[:, 0]), final, x, seen, bodies)
-            size = figure.add_subplot(grid[0, 1])
-            _draw_sizes(size, history)
-            _draw_cases(figure.add_subplot(grid[1, 1], sharex=size), history)
-            drawn = []
+            figure = Figure(figsize=size, layout="constrained")
+            draw(figure)
             for path in paths:
                 content = io.BytesIO()
                 figure.savefig(content, format=path.suffix[1:])
@@ -143,13 +156,13 @@ def _fonts() -> list[str]:
     return ["sans-serif", *(font for font in WIDE_FONTS if font in there)]
 
 
-def _thinned(values: np.ndarray) -> np.ndarray:
+def thinned(values: np.ndarray) -> np.ndarray:
     """At most `MOST_POINTS` of the values, evenly spaced, the last one included."""
     step = -(-len(values) // MOST_POINTS)
     return values if step <= 1 else values[(len(values) - 1) % step :: step]
 
 
-def _plain(name: str) -> str:
+def plain_name(name: str) -> str:
     """The name for matplotlib: a dollar starts no formula, and a leading underscore does not hide it from a legend."""
     name = name if len(name) <= 24 else f"{name[:23]}…"
     return (" " if name.startswith("_") else "") + name.replace("$", r"\$")
@@ -158,32 +171,32 @@ def _plain(name: str) -> str:
 def _draw_map(axes: Axes, final: dict, x: np.ndarray, seen: np.ndarray, bodies: Sequence[str]) -> None:
     for body in bodies:
         k = bodies.index(body)
-        path = _thinned(x[seen[:, k], k])
+        path = thinned(x[seen[:, k], k])
         if len(path) == 0:  # its only sample was the last one, where velocities from differences do not exist
             continue
         if body not in final:
             axes.plot(*path.T, color="0.75", lw=1)
             axes.plot(*path[-1], "o", color="0.6", ms=6)
             continue
-        colour = _colour(list(final).index(body))
-        axes.plot(*path.T, color=colour, lw=1.2, alpha=0.8)
-        axes.plot(*path[0], "o", color=colour, ms=4, mfc="white")
-        axes.plot(*path[-1], "o", color=colour, ms=6)
+        mine = colour(list(final).index(body))
+        axes.plot(*path.T, color=mine, lw=1.2, alpha=0.8)
+        axes.plot(*path[0], "o", color=mine, ms=4, mfc="white")
+        axes.plot(*path[-1], "o", color=mine, ms=6)
     labels: Counter[tuple[float, ...]] = Counter()
     for i, (robot, region) in enumerate(final.items()):
         if len(region["centroid"]) != 2 or None in region["centroid"]:  # not planar, or empty
             continue
         vertices = np.array(region["vertices"])
         is_ok = region["status"] == "ok"
-        axes.fill(*vertices.T, facecolor=_colour(i) if is_ok else "0.5", edgecolor="none", alpha=0.3 if is_ok else 0.15)
-        axes.fill(*vertices.T, facecolor="none", edgecolor=_colour(i), alpha=0.6, lw=1.2, ls="-" if is_ok else "--")
-        axes.plot(*region["centroid"], "+", color=_colour(i), ms=11, mew=1.6)
+        axes.fill(*vertices.T, facecolor=colour(i) if is_ok else "0.5", edgecolor="none", alpha=0.3 if is_ok else 0.15)
+        axes.fill(*vertices.T, facecolor="none", edgecolor=colour(i), alpha=0.6, lw=1.2, ls="-" if is_ok else "--")
+        axes.plot(*region["centroid"], "+", color=colour(i), ms=11, mew=1.6)
         axes.annotate(
-            f"{_plain(robot)}: {region['diameter']:.2g} m" + ("" if is_ok else f", {region['status']}"),
+            f"{plain_name(robot)}: {region['diameter']:.2g} m" + ("" if is_ok else f", {region['status']}"),
             region["centroid"],
             textcoords="offset points",
             xytext=(7, 7 - 12 * labels[tuple(region["centroid"])]),
-            color=_colour(i),
+            color=colour(i),
         )
         labels[tuple(region["centroid"])] += 1  # sets that were never cut have the same centroid
     axes.set(xlabel="x [m]", ylabel="y [m]", title="Final regions, centroids, diameters")
@@ -197,7 +210,7 @@ def _draw_map(axes: Axes, final: dict, x: np.ndarray, seen: np.ndarray, bodies: 
 
 def _draw_sizes(axes: Axes, history: dict[str, dict[str, np.ndarray]]) -> None:
     for i, (robot, of) in enumerate(history.items()):
-        axes.plot(_thinned(of["t"]), _thinned(of["diameter"]), color=_colour(i), lw=1.5, label=_plain(robot))
+        axes.plot(thinned(of["t"]), thinned(of["diameter"]), color=colour(i), lw=1.5, label=plain_name(robot))
     sizes = np.concatenate([of["diameter"] for of in history.values()])
     sizes = sizes[sizes > 0]
     if len(sizes) and sizes.max() > 2 * sizes.min():
@@ -212,13 +225,13 @@ def _draw_sizes(axes: Axes, history: dict[str, dict[str, np.ndarray]]) -> None:
 
 
 def _draw_cases(axes: Axes, history: dict[str, dict[str, np.ndarray]]) -> None:
-    cases = np.stack([_thinned(of["case"]) for of in history.values()])
-    t = _thinned(next(iter(history.values()))["t"])
+    cases = np.stack([thinned(of["case"]) for of in history.values()])
+    t = thinned(next(iter(history.values()))["t"])
     ends = np.append(t, t[-1] + (t[-1] - t[-2] if len(t) > 1 else 1.0))
     colours = ListedColormap(CASE_GREYS)
     axes.pcolormesh(ends, np.arange(len(history) + 1), cases, cmap=colours, vmin=-0.5, vmax=4.5, rasterized=True)
     named = len(history) <= MOST_NAMED
-    axes.set_yticks(np.arange(len(history)) + 0.5 if named else [], map(_plain, history) if named else [])
+    axes.set_yticks(np.arange(len(history)) + 0.5 if named else [], map(plain_name, history) if named else [])
     axes.invert_yaxis()
     axes.set(xlabel="t [s]", ylabel="robot", title="Case")
     handles = [Patch(facecolor=grey, edgecolor="0.5", label=case) for case, grey in zip(CASES, CASE_GREYS, strict=True)]
@@ -233,5 +246,5 @@ def _draw_cases(axes: Axes, history: dict[str, dict[str, np.ndarray]]) -> None:
     )
 
 
-def _colour(i: int) -> str:
+def colour(i: int) -> str:
     return ROBOT_COLOURS[i % len(ROBOT_COLOURS)]

@@ -15,6 +15,7 @@ from torchfsid.commands.figures import draw_observation
 from torchfsid.commands.hypotheses import Hypotheses
 from torchfsid.commands.observe import Observation
 from torchfsid.commands.results_folder import ResultsFolder, write_json, write_whole
+from torchfsid.commands.safety_figure import draw_safety
 from torchfsid.commands.terminal import console, status, track
 from torchfsid.config.documents import dump
 from torchfsid.config.models import dump_models
@@ -24,6 +25,9 @@ from torchfsid.logs.read import read_log
 
 FILES = ("estimates.csv", "regions.json", "regions.png", "regions.pdf")
 """What an observation leaves beside config.yaml."""
+
+SAFETY_FILES = ("safety.png", "safety.pdf")
+"""What it leaves besides, where safety parameters are unknown."""
 
 CHECKED = "check.json"
 
@@ -37,7 +41,7 @@ def observe_log(path: Path, models: Mapping[str, ObserveConfig], folder: Results
     log = read_log(path, next(iter(models.values())).bag)
     run = _ready({name: DeclaredLog(model, log) for name, model in models.items()})
     of_each = run.observations if isinstance(run, Hypotheses) else {"": run}
-    files = [f"{name}/{file}" if name else file for name in of_each for file in ("config.yaml", *FILES)]
+    files = [f"{name}/{file}" if name else file for name in of_each for file in ("config.yaml", *FILES, *SAFETY_FILES)]
     also = ["velocity_bound.json", *(["hypotheses.json"] if isinstance(run, Hypotheses) else [])]
     folder.claim([*files, *also], dump_models({name: of.config for name, of in of_each.items()}))
     if run.smallest_bounds is not None:
@@ -54,6 +58,8 @@ def observe_log(path: Path, models: Mapping[str, ObserveConfig], folder: Results
             with status("Drawing"):
                 seen = observation.log
                 draw_observation(out, seen.x, seen.seen, seen.bodies)
+                if observation.config.is_unknown:
+                    draw_safety(out)
         except (OSError, FigureError) as problem:
             problems.append(problem)
     if isinstance(run, Hypotheses):

@@ -48,7 +48,7 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
             f"More than half of noise.velocity, {observation.velocity_bound:g} m/s, is needed by "
             f"{escape(', '.join(strained))}: if the errors are not that large, the model is wrong (torchfsid check)"
         )
-    files = ("estimates.csv", "regions.json", "config.yaml", "regions.png", "regions.pdf")
+    files = ("estimates.csv", "regions.json", "config.yaml", "regions.png", "regions.pdf", "safety.png", "safety.pdf")
     there = ", ".join(file for file in files if (out / file).is_file())
     console.print(escape(f"Results: {out}/{there}"))
 
@@ -57,7 +57,7 @@ def _print_safety(observer: SafetyObserver, robots: Sequence[str], labels: Seque
     """Print what was learned about the safety parameters, of the team or of each robot."""
     unknown = observer.model.unknown
     what = "safety distance" if unknown.margin is None else "margin"
-    shown = table("safety parameters", ["of"], ["gain", f"{what} \\[m]"])
+    shown = table("safety parameters", ["of"], ["gain", f"{what} [m]"])
     intervals, (of_gain, of_distance) = unknown.intervals(observer.safety), unknown.bounded_by_data(observer.safety)
     for i, name in enumerate(["the team"] if observer.is_shared else robots):
         gain = _interval(intervals.gain[i].tolist(), of_gain[i].tolist())
@@ -83,9 +83,10 @@ def _print_safety(observer: SafetyObserver, robots: Sequence[str], labels: Seque
 
 
 def _interval(ends: Sequence[float], by_data: Sequence[bool]) -> str:
-    """The interval as text, with a star at the ends that only the prior bounds."""
-    width = ends[1] - ends[0]
-    low, high = (digits(end, width) + ("" if known else "*") for end, known in zip(ends, by_data, strict=True))
+    """The interval as text, rounded outward, with a star at the ends that only the prior bounds."""
+    step = 10.0 ** math.floor(math.log10(max(ends[1] - ends[0], 1e-12 * abs(ends[1]), 1e-300)) - 2)
+    outward = (math.floor(ends[0] / step) * step, math.ceil(ends[1] / step) * step)
+    low, high = (digits(end, 100 * step) + ("" if known else "*") for end, known in zip(outward, by_data, strict=True))
     return f"{low} .. {high}"
 
 

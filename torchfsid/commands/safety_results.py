@@ -6,6 +6,7 @@
       safety_distance: [low, high]         with a margin also that, and this is for the pair of the commonest radii
       bounded_by_data: {gain: [.., ..], safety_distance: [.., ..]}         false: only the prior bounds this end
       approach_speed: [[r, low, high], ...]       how fast a robot may approach a standing body at distance r
+      largest_speed          of a robot in the log [m/s]
       facets                 from which sample each row of A, b came, null for the prior
     }
 
@@ -27,15 +28,15 @@ from torchfsid.sets.feasible_set import FeasibleSet
 
 COLUMNS = ("gain_low", "gain_high", "distance_low", "distance_high")
 
-POINTS = 33
+POINTS = 65
 """Distances at which the band of speeds is written."""
 
 
 class Distances:
-    """The least and the largest distance between a robot and another body, over all samples [m]."""
+    """The least and the largest distance between a robot and another body [m], and the largest speed [m/s]."""
 
     def __init__(self) -> None:
-        self.least, self.largest = math.inf, 0.0
+        self.least, self.largest, self.fastest = math.inf, 0.0, 0.0
 
     def see(self, measurement: Measurement) -> None:
         """Take in one sample."""
@@ -44,12 +45,17 @@ class Distances:
             present = present & measurement.observed.unsqueeze(-1)
         r = (measurement.x.unsqueeze(-2) - measurement.bodies).norm(dim=-1)[present]
         r = r[r.isfinite() & (r > 0)]
+        if measurement.u is not None:
+            speeds = measurement.u.norm(dim=-1)[present.any(-1)]
+            self.fastest = max([self.fastest, *speeds[speeds.isfinite()].tolist()])
         if len(r):
             self.least, self.largest = min(self.least, float(r.min())), max(self.largest, float(r.max()))
 
     def points(self) -> Tensor:
         """Distances from the least to the largest [m]. None if no body was seen."""
-        return torch.linspace(self.least, self.largest, POINTS if self.largest > 0 else 0, dtype=torch.float64)
+        if self.largest <= 0:
+            return torch.zeros(0, dtype=torch.float64)
+        return torch.linspace(math.log(self.least), math.log(self.largest), POINTS, dtype=torch.float64).exp()
 
 
 class SafetyColumns:
@@ -85,6 +91,7 @@ def safety(observer: SafetyObserver, robot: int, seen: Distances, robots: Sequen
         "safety_distance": (intervals.distance[0] + (0.0 if unknown.margin is None else unknown.reference)).tolist(),
         "bounded_by_data": {"gain": of_gain[0].tolist(), "safety_distance": of_distance[0].tolist()},
         "approach_speed": torch.cat([r.unsqueeze(-1), band], dim=-1).tolist(),
+        "largest_speed": seen.fastest,
         "facets": [
             None if source < 0 else _origin(time, *divmod(source, len(labels)), robots, labels)
             for time, source in zip(facets.time[0][real].tolist(), facets.source[0][real].tolist(), strict=True)
