@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchfsid.commands.check_safety import SafetyCheck, check_safety
 from torchfsid.commands.declared_log import AUTO_FACTOR, DeclaredLog
 from torchfsid.commands.results import constraint_name, seconds
 from torchfsid.observers.consistency import Consistency, Fit
@@ -86,6 +87,7 @@ class Check:
         fastest: the largest speed in the log [m/s].
         shifts: number of samples by which velocities are taken later, to the `smallest_bound` then [m/s]. It is
             infinite if it is not below that without a shift.
+        safety: what the log says about gain and safety distance. None where that is not asked.
     """
 
     robots: tuple[RobotCheck, ...]
@@ -93,6 +95,7 @@ class Check:
     is_auto: bool
     fastest: float
     shifts: dict[int, float]
+    safety: SafetyCheck | None
 
     @property
     def smallest_bound(self) -> float:
@@ -111,7 +114,7 @@ class Check:
         lines = [f"nothing can be said of {', '.join(silent)}: no sample could be used"] if silent else []
         if len(silent) == len(self.robots):
             return lines
-        lines.append(self._fit())
+        lines += [self._fit(), *([] if self.safety is None else [self.safety.conclusion()])]
         if len(self.shifts) == 1:
             lines.append("nothing can be said of the alignment of velocities and positions: the log is too short")
         elif self.best_shift:
@@ -166,6 +169,7 @@ class Check:
             "best_shift": self.best_shift,
             "shifts": {str(shift): _finite(bound) for shift, bound in sorted(self.shifts.items())},
             "conclusions": self.conclusions(),
+            "safety": None if self.safety is None else self.safety.to_json(),
             "robots": {
                 robot.robot: {
                     "smallest_bound": _finite(robot.smallest_bound),
@@ -221,7 +225,7 @@ def check(declared: DeclaredLog) -> Check:
                 violations=faults.violations(i),
             )
         )
-    return Check(tuple(robots), velocity, bound == "auto", fastest, shifts)
+    return Check(tuple(robots), velocity, bound == "auto", fastest, shifts, check_safety(declared))
 
 
 class _Faults:

@@ -13,8 +13,11 @@ from torchfsid.commands.check import Check
 from torchfsid.commands.hypotheses import Hypotheses, HypothesisVerdict
 from torchfsid.commands.observe import Observation, Verdict
 from torchfsid.commands.results import seconds
-from torchfsid.commands.terminal import digits, table
+from torchfsid.commands.terminal import digits, ends, table
 from torchfsid.observers.safety import SafetyObserver
+
+MOST_COLUMNS = 4
+"""Models beyond which the table of hypotheses has a line, not a column, for each."""
 
 
 def print_verdicts(observation: Observation, out: Path, console: Console) -> None:
@@ -60,8 +63,8 @@ def _print_safety(observer: SafetyObserver, robots: Sequence[str], labels: Seque
     shown = table("safety parameters", ["of"], ["gain", f"{what} [m]"])
     intervals, (of_gain, of_distance) = unknown.intervals(observer.safety), unknown.bounded_by_data(observer.safety)
     for i, name in enumerate(["the team"] if observer.is_shared else robots):
-        gain = _interval(intervals.gain[i].tolist(), of_gain[i].tolist())
-        shown.add_row(escape(name), gain, _interval(intervals.distance[i].tolist(), of_distance[i].tolist()))
+        gain = ends(intervals.gain[i].tolist(), of_gain[i].tolist())
+        shown.add_row(escape(name), gain, ends(intervals.distance[i].tolist(), of_distance[i].tolist()))
     console.print(shown)
     if not bool(of_gain.all() & of_distance.all()):
         console.print("* not bounded by the data: this end holds only because of the declared interval")
@@ -82,36 +85,44 @@ def _print_safety(observer: SafetyObserver, robots: Sequence[str], labels: Seque
         console.print(escape(f"without {names} the others can have the same parameters"))
 
 
-def _interval(ends: Sequence[float], by_data: Sequence[bool]) -> str:
-    """The interval as text, rounded outward, with a star at the ends that only the prior bounds."""
-    step = 10.0 ** math.floor(math.log10(max(ends[1] - ends[0], 1e-12 * abs(ends[1]), 1e-300)) - 2)
-    outward = (math.floor(ends[0] / step) * step, math.ceil(ends[1] / step) * step)
-    low, high = (digits(end, 100 * step) + ("" if known else "*") for end, known in zip(outward, by_data, strict=True))
-    return f"{low} .. {high}"
-
-
 def print_hypotheses(hypotheses: Hypotheses, out: Path, console: Console) -> None:
     """Print which hypotheses are left for each robot, and what refuted the others."""
-    names = list(hypotheses.observations)
-    verdicts = table("which task is it?", ["robot"], [*names, "left"])
+    names, found = list(hypotheses.observations), hypotheses.verdicts()
+    cells = {robot: [_cell(of_robot.get(name)) for name in names] for robot, of_robot in found.items()}
+    left = [
+        ", ".join(name for name in names if name in of_robot and of_robot[name].refuted_at is None)
+        or "[bold red]none[/]"
+        for of_robot in found.values()
+    ]
+    if len(names) <= MOST_COLUMNS:
+        verdicts = table("which model is it?", ["robot"], [*names, "left"])
+        for robot, of_robot, names_left in zip(found, cells.values(), left, strict=True):
+            verdicts.add_row(escape(robot), *of_robot, names_left)
+    else:
+        verdicts = table("which model is it?", ["model"], list(found))
+        for name, of_model in zip(names, zip(*cells.values(), strict=True), strict=True):
+            verdicts.add_row(escape(name), *of_model)
+        verdicts.add_section()
+        verdicts.add_row("left", *left)
     for column in verdicts.columns[1:]:
         column.justify = "left"
-    for robot, of_robot in hypotheses.verdicts().items():
-        cells, left = [], []
-        for name in names:
-            verdict = of_robot.get(name)
-            if verdict is None:
-                cells.append("-")
-            elif verdict.refuted_at is not None:
-                cells.append(f"refuted at {seconds(verdict.refuted_at)} by {' / '.join(_rows(verdict))}")
-            else:
-                left.append(name)
-                alarm = "" if verdict.status == "ok" else f", {_status(verdict.status)}"
-                cells.append(f"possible, volume {_size(verdict.volume)}{alarm}")
-        verdicts.add_row(escape(robot), *cells, ", ".join(left) or "[bold red]none[/]")
     console.print(verdicts)
+    for name, observation in hypotheses.observations.items():
+        if isinstance(observation.sets, SafetyObserver) and observation.sets.model.unknown.shared == "team":
+            if not observation.sets.is_shared:
+                console.print(escape(f"{name}: the robots have no safety parameters in common, each has its own"))
     _print_bound(console, hypotheses.smallest_bounds, hypotheses.velocity_bound)
     console.print(escape(f"Results: {out}/hypotheses.json, and a folder for each of {', '.join(names)}"))
+
+
+def _cell(verdict: HypothesisVerdict | None) -> str:
+    """What the log says about one model for one robot."""
+    if verdict is None:
+        return "-"
+    if verdict.refuted_at is not None:
+        return f"refuted at {seconds(verdict.refuted_at)} by {' / '.join(_rows(verdict))}"
+    alarm = "" if verdict.status == "ok" else f", {_status(verdict.status)}"
+    return f"possible, volume {_size(verdict.volume)}{alarm}"
 
 
 def print_check(found: Check, name: str, console: Console) -> None:

@@ -93,7 +93,7 @@ def safety(observer: SafetyObserver, robot: int, seen: Distances, robots: Sequen
         "approach_speed": torch.cat([r.unsqueeze(-1), band], dim=-1).tolist(),
         "largest_speed": seen.fastest,
         "facets": [
-            None if source < 0 else _origin(time, *divmod(source, len(labels)), robots, labels)
+            None if source < 0 else _origin(time, source // len(labels), source % len(labels), robots, labels)
             for time, source in zip(facets.time[0][real].tolist(), facets.source[0][real].tolist(), strict=True)
         ],
     }

@@ -123,6 +123,14 @@ def digits(value: float, resolution: float) -> str:
     return f"{value:.{enough}g}"
 
 
+def ends(interval: Sequence[float], by_data: Sequence[bool] = (True, True)) -> str:
+    """An interval as text, rounded outward, with a star at the ends that the data do not bound."""
+    low, high = interval
+    step = 10.0 ** (math.floor(math.log10(max(high - low, 1e-6 * abs(high), 1e-300))) - 1)
+    outward = (math.floor(low / step) * step, math.ceil(high / step) * step)
+    return " .. ".join(f"{end:.7g}" + ("" if known else "*") for end, known in zip(outward, by_data, strict=True))
+
+
 def _first(what: str, shown: Console) -> str:
     """The text to show during the first item: kernels are compiled when they are first used."""
     from torchfsid.kernels.compiled import folder

@@ -28,7 +28,10 @@ from torchfsid.sets.feasible_set import FeasibleSet
 from torchfsid.tolerances import ROUND_OFF
 
 ITEMS = 16384
-"""Robots times samples that are read at once."""
+"""Robots times samples that are read at once, at most."""
+
+BLOCK = 64
+"""Samples that are read at once while all are read: with less, Psi is smaller when the later ones are read."""
 
 MOST_CELLS = 16
 """Cells of Psi, beyond which none is split."""
@@ -121,7 +124,7 @@ def second_look(
         Smaller sets. If no parameters explain the motions, some of them are EMPTY.
     """
     robots, first = len(possible.owner), Cell(possible, ())
-    size = max(1, ITEMS // max(robots, 1))
+    size = max(1, min(BLOCK, ITEMS // max(robots, 1)))
     samples = []
     for k in range(0, len(measurements), size):
         together = Measurement.concatenate(measurements[k : k + size])
@@ -162,10 +165,31 @@ def _contracted(model: LearningModel, cell: Cell) -> Cell:
                 return Cell(possible, ())
             undecided = read.undecided & ~part.settled
             found.append(Samples(part.measurement, part.settled, undecided, read.high).open(robots))
-        samples = tuple(part for part in found if len(part.measurement.x) > 0)
+        samples = _joined([part for part in found if len(part.measurement.x) > 0])
         if not samples or float(possible.psi.volume()) > SHRUNK * before:
             break
     return Cell(possible, samples)
+
+
+def _joined(parts: Sequence[Samples]) -> tuple[Samples, ...]:
+    """The same samples in as few parts as `ITEMS` allows."""
+    together: list[list[Samples]] = []
+    for part in parts:
+        if together and sum(len(other.measurement.x) for other in together[-1]) + len(part.measurement.x) <= ITEMS:
+            together[-1].append(part)
+        else:
+            together.append([part])
+    return tuple(
+        Samples(
+            Measurement.concatenate([part.measurement for part in some]),
+            torch.cat([part.settled for part in some]),
+            torch.cat([part.undecided for part in some]),
+            Halfspaces(torch.cat([part.high.A for part in some]), torch.cat([part.high.b for part in some])),
+        )
+        if len(some) > 1
+        else some[0]
+        for some in together
+    )
 
 
 def _around(unknown: UnknownAvoidance, before: Possible, cells: Sequence[Possible]) -> Possible:
