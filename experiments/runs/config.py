@@ -137,6 +137,8 @@ class ExperimentConfig(Strict):
 
     @model_validator(mode="after")
     def _can_be_simulated(self) -> Self:
+        if self.task.is_unknown:
+            raise wrong("expected a number, not [low, high]: robots that are simulated have it", "task.gain")
         for i, barrier in enumerate(self.barriers):
             if barrier.is_unknown:
                 raise wrong("expected numbers, not [low, high]: robots that are simulated have them", f"barriers[{i}]")

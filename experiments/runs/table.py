@@ -45,9 +45,7 @@ def _measure(i: int, results: Results, observers: Observers) -> dict[str, Any]:
     config, tally = observers.config, observers.tally
     assert isinstance(config, CasesConfig)
     case, duration = config.cases[i], config.dt * tally.samples
-    information_rank = int(
-        torch.linalg.matrix_rank(tally.information[i], atol=RANK_TOLERANCE * config.task.gain**2 * duration)
-    )
+    information_rank = int(torch.linalg.matrix_rank(tally.information[i], atol=RANK_TOLERANCE * gain**2 * duration))
     error = results.error("ukf_0", "ukf_1")[:, i]
     prior_error = np.linalg.norm((np.array(config.prior.lower) + config.prior.upper) / 2 - config.goal)
     before, after = (torch.linalg.eigvalsh(of[i]).sqrt() for of in (tally.prior_covariance, tally.covariance))

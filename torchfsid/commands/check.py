@@ -114,7 +114,7 @@ class Check:
         lines = [f"nothing can be said of {', '.join(silent)}: no sample could be used"] if silent else []
         if len(silent) == len(self.robots):
             return lines
-        lines += [self._fit(), *([] if self.safety is None else [self.safety.conclusion()])]
+        lines.append(self._fit())
         if len(self.shifts) == 1:
             lines.append("nothing can be said of the alignment of velocities and positions: the log is too short")
         elif self.best_shift:
@@ -136,7 +136,7 @@ class Check:
                     f"{name} at {self.declared:.3g} m/s: {_count(faults)}, the first at {seconds(first.first)} "
                     f"({first.row}), most by {most} ({_count(faults, most)})"
                 )
-        return lines
+        return lines if self.safety is None else [*lines, self.safety.conclusion()]
 
     def _fit(self) -> str:
         unexplained = [robot.robot for robot in self.robots if math.isinf(robot.smallest_bound)]

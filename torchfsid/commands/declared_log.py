@@ -109,6 +109,13 @@ class DeclaredLog:
         other.config = self.config.with_velocity_bound(bound)
         return other
 
+    def with_task_gain(self, gain: tuple[float, float]) -> DeclaredLog:
+        """The same log and model with another interval for the gain of its task [1/s]."""
+        other = copy(self)
+        other.config = self.config.model_copy(update={"task": self.config.task.model_copy(update={"gain": gain})})
+        other.task = other.config.task.build(self.log.bodies)
+        return other
+
     def smallest_bounds(self) -> dict[str, float]:
         """For each robot, the smallest velocity bound with which the model explains its motion [m/s].
 

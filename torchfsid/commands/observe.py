@@ -12,6 +12,7 @@ import torch
 
 from torchfsid.commands.declared_log import AUTO_FACTOR, DeclaredLog, automatic_bound
 from torchfsid.commands.results import STATUS_NAMES, ResultsWriter, constraint_name, of_sets, seconds
+from torchfsid.commands.task_gain import TaskGain, narrowed
 from torchfsid.config.observe import ObserveConfig
 from torchfsid.errors import FsidError, InconsistentError
 from torchfsid.identification.kkt import CASES
@@ -62,9 +63,11 @@ class Observation:
 
     Attributes:
         declared: the log and the model. With `velocity: auto`, with the bound that was determined.
+        stated: the configuration to repeat the run with.
         sets: the observer of the sets.
         observer: `sets` alone, or combined with the filter if the configuration has one.
         smallest_bounds: with `velocity: auto`, each robot's smallest velocity bound that explains its motion [m/s].
+        task_gain: where the gain of the task is unknown, the gains that can explain the log.
 
     Raises:
         ConfigError: no bound explains some robot, see `automatic_bound`.
@@ -73,13 +76,18 @@ class Observation:
     declared: DeclaredLog
     sets: SetObserver = field(init=False)
     observer: SetObserver | HybridObserver = field(init=False)
+    stated: ObserveConfig = field(init=False)
     smallest_bounds: dict[str, float] | None = field(init=False, default=None)
+    task_gain: TaskGain | None = field(init=False, default=None)
     _cases: dict[str, Counter[str]] = field(init=False)
 
     def __post_init__(self) -> None:
         if self.config.noise.velocity == "auto":
             self.smallest_bounds = self.declared.smallest_bounds()
             self.declared = self.declared.with_velocity_bound(automatic_bound(self.smallest_bounds))
+        self.stated = self.declared.config
+        if self.config.task.is_unknown:
+            self.declared, self.task_gain = narrowed(self.declared)
         self._cases = {robot: Counter() for robot in self.robots}
         self.observer = self.config.build_observer(self.declared.task, self.declared.barriers, len(self.robots))
         self.sets = self.observer.sets if isinstance(self.observer, HybridObserver) else self.observer

@@ -26,8 +26,8 @@ from torchfsid.logs.read import read_log
 FILES = ("estimates.csv", "regions.json", "regions.png", "regions.pdf")
 """What an observation leaves beside config.yaml."""
 
-SAFETY_FILES = ("safety.png", "safety.pdf")
-"""What it leaves besides, where safety parameters are unknown."""
+UNKNOWN_FILES = ("safety.png", "safety.pdf", "task_gain.json")
+"""What it leaves besides, where safety parameters or the gain of the task are unknown."""
 
 CHECKED = "check.json"
 
@@ -41,9 +41,9 @@ def observe_log(path: Path, models: Mapping[str, ObserveConfig], folder: Results
     log = read_log(path, next(iter(models.values())).bag)
     run = _ready({name: DeclaredLog(model, log) for name, model in models.items()})
     of_each = run.observations if isinstance(run, Hypotheses) else {"": run}
-    files = [f"{name}/{file}" if name else file for name in of_each for file in ("config.yaml", *FILES, *SAFETY_FILES)]
+    files = [f"{name}/{file}" if name else file for name in of_each for file in ("config.yaml", *FILES, *UNKNOWN_FILES)]
     also = ["velocity_bound.json", *(["hypotheses.json"] if isinstance(run, Hypotheses) else [])]
-    folder.claim([*files, *also], dump_models({name: of.config for name, of in of_each.items()}))
+    folder.claim([*files, *also], dump_models({name: of.stated for name, of in of_each.items()}))
     if run.smallest_bounds is not None:
         found = {"smallest": run.smallest_bounds, "factor": AUTO_FACTOR, "used": run.velocity_bound}
         write_json(folder.path / "velocity_bound.json", found)
@@ -53,7 +53,9 @@ def observe_log(path: Path, models: Mapping[str, ObserveConfig], folder: Results
         try:
             if name:
                 out.mkdir(exist_ok=True)
-                write_whole(out / "config.yaml", dump(observation.config))
+                write_whole(out / "config.yaml", dump(observation.stated))
+            if observation.task_gain is not None:
+                write_json(out / "task_gain.json", observation.task_gain.to_json())
             observation.run(out, partial(track, what=f"Observing {name}".strip(), total=observation.samples))
             with status("Drawing"):
                 seen = observation.log
@@ -93,6 +95,7 @@ def check_log(path: Path, models: Mapping[str, ObserveConfig], folder: ResultsFo
 
 def _ready(models: Mapping[str, DeclaredLog]) -> Observation | Hypotheses:
     first = next(iter(models.values()))
-    finding = status("Finding the velocity bound", computes=True)
-    with finding if first.config.noise.velocity == "auto" else nullcontext():
+    auto, gain = first.config.noise.velocity == "auto", any(model.config.task.is_unknown for model in models.values())
+    finding = status("Narrowing the gain" if gain else "Finding the velocity bound", computes=True)
+    with finding if auto or gain else nullcontext():
         return Hypotheses(models) if len(models) > 1 else Observation(first)

@@ -13,6 +13,7 @@ from torchfsid.commands.check import Check
 from torchfsid.commands.hypotheses import Hypotheses, HypothesisVerdict
 from torchfsid.commands.observe import Observation, Verdict
 from torchfsid.commands.results import seconds
+from torchfsid.commands.task_gain import TaskGain
 from torchfsid.commands.terminal import digits, ends, table
 from torchfsid.observers.safety import SafetyObserver
 
@@ -43,6 +44,8 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
             _status(verdict.status) + resets,
         )
     console.print(verdicts)
+    if observation.task_gain is not None:
+        _print_task_gain(observation.task_gain, console)
     if isinstance(observation.sets, SafetyObserver):
         _print_safety(observation.sets, observation.robots, observation.declared.row_labels, console)
     _print_bound(console, observation.smallest_bounds, observation.velocity_bound)
@@ -54,6 +57,15 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
     files = ("estimates.csv", "regions.json", "config.yaml", "regions.png", "regions.pdf", "safety.png", "safety.pdf")
     there = ", ".join(file for file in files if (out / file).is_file())
     console.print(escape(f"Results: {out}/{there}"))
+
+
+def _print_task_gain(found: TaskGain, console: Console) -> None:
+    declared = f"declared {ends(found.declared)}"
+    if not found.explains:
+        console.print(f"no gain of the task explains the log ({declared})")
+        return
+    said = "" if all(found.by_data) else "; * not bounded by the data"
+    console.print(f"gain of the task: {ends(found.found, found.by_data)} 1/s ({declared}{said})")
 
 
 def _print_safety(observer: SafetyObserver, robots: Sequence[str], labels: Sequence[str], console: Console) -> None:
@@ -108,9 +120,8 @@ def print_hypotheses(hypotheses: Hypotheses, out: Path, console: Console) -> Non
         column.justify = "left"
     console.print(verdicts)
     for name, observation in hypotheses.observations.items():
-        if isinstance(observation.sets, SafetyObserver) and observation.sets.model.unknown.shared == "team":
-            if not observation.sets.is_shared:
-                console.print(escape(f"{name}: the robots have no safety parameters in common, each has its own"))
+        if isinstance(observation.sets, SafetyObserver) and observation.sets.team_is_refuted:
+            console.print(escape(f"{name}: the robots have no safety parameters in common, each has its own"))
     _print_bound(console, hypotheses.smallest_bounds, hypotheses.velocity_bound)
     console.print(escape(f"Results: {out}/hypotheses.json, and a folder for each of {', '.join(names)}"))
 

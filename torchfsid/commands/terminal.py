@@ -126,8 +126,9 @@ def digits(value: float, resolution: float) -> str:
 def ends(interval: Sequence[float], by_data: Sequence[bool] = (True, True)) -> str:
     """An interval as text, rounded outward, with a star at the ends that the data do not bound."""
     low, high = interval
-    step = 10.0 ** (math.floor(math.log10(max(high - low, 1e-6 * abs(high), 1e-300))) - 1)
-    outward = (math.floor(low / step) * step, math.ceil(high / step) * step)
+    width = max(high - low, 1e-6 * abs(high))
+    steps = [10.0 ** (math.floor(math.log10(max(min(width, abs(end) or width), 1e-300))) - 1) for end in interval]
+    outward = (math.floor(low / steps[0]) * steps[0], math.ceil(high / steps[1]) * steps[1])
     return " .. ".join(f"{end:.7g}" + ("" if known else "*") for end, known in zip(outward, by_data, strict=True))
 
 

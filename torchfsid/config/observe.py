@@ -81,6 +81,12 @@ class ObserveConfig(Strict):
             raise wrong("critical_region needs known safety parameters, take inverse_optimal", "set")
         if self.set == "critical_region" and self.task.is_clipped:
             raise wrong("critical_region knows no saturation or dead zone, take inverse_optimal", "set")
+        if self.task.is_unknown and self.set == "critical_region":
+            raise wrong("critical_region needs a known gain, take inverse_optimal", "set")
+        if self.task.is_unknown and self.on_inconsistent == "reset":
+            raise wrong("a gain can be narrowed only where robots keep their goals", "on_inconsistent")
+        if self.task.is_unknown and self.noise.velocity == "auto":
+            raise wrong("auto takes an error of the gain for noise, give a number or a known gain", "noise")
         if self.noise.velocity == "auto" and self.on_inconsistent == "reset":
             raise wrong("auto takes a change of goal for noise, give a number or take on_inconsistent: hold", "noise")
         return self

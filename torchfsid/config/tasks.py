@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from pydantic import Field, model_validator
 
 from torchfsid.config.documents import Strict, wrong
-from torchfsid.config.quantities import BodyName, NonNegative, Number, PlanarVector, Positive, require_body
+from torchfsid.config.quantities import (
+    BodyName,
+    NonNegative,
+    Number,
+    PlanarVector,
+    Positive,
+    PositiveOrInterval,
+    as_interval,
+    require_body,
+    require_interval,
+)
 
 if TYPE_CHECKING:
     from torchfsid.robots.tasks import Task
@@ -50,6 +60,11 @@ class _Task(Strict):
         return False
 
     @property
+    def is_unknown(self) -> bool:
+        """Is the gain given as [low, high]?"""
+        return False
+
+    @property
     def required(self) -> tuple[str, ...]:
         """The bodies without which a measurement says nothing about theta."""
         return ()
@@ -59,21 +74,29 @@ class GoalConfig(_Task):
     """`GoalTask`: go to a goal with a known gain.
 
     Attributes:
-        gain: gain of the nominal control [1/s].
+        gain: gain of the nominal control [1/s], a number or bounds [low, high]. `torchfsid observe` narrows the bounds.
         saturation: how the nominal control is clipped. Default: not at all.
         dead_zone: distance from the goal within which the nominal control is zero [m].
     """
 
     kind: Literal["goal"] = "goal"
-    gain: Positive
+    gain: PositiveOrInterval
     saturation: SaturationConfig | None = None
     dead_zone: NonNegative = 0.0
 
     @model_validator(mode="after")
     def _moves_at_all(self) -> GoalConfig:
-        if min(self._limits) <= self.gain * self.dead_zone:
-            raise wrong(f"at its edge the speed is {self.gain * self.dead_zone}, not below the limit", "dead_zone")
+        require_interval("gain", self.gain)
+        if self.is_unknown and self.dead_zone > 0:
+            raise wrong("expected a known gain with a dead_zone", "gain")
+        if min(self._limits) <= max(as_interval(self.gain)) * self.dead_zone:
+            at_edge = max(as_interval(self.gain)) * self.dead_zone
+            raise wrong(f"at its edge the speed is {at_edge}, not below the limit", "dead_zone")
         return self
+
+    @property
+    def is_unknown(self) -> bool:
+        return isinstance(self.gain, tuple)
 
     @property
     def is_clipped(self) -> bool:
@@ -90,10 +113,13 @@ class GoalConfig(_Task):
         """The `GoalTask` with these values."""
         from torchfsid.robots.tasks import GoalTask, Saturation
 
+        low, high = as_interval(self.gain)
+        gain, error = (low + high) / 2, (high - low) / 2
         if not self.is_clipped:
-            return GoalTask(self.gain)
+            return GoalTask(gain, gain_error=error)
         shape = "norm" if self.saturation is None else self.saturation.kind
-        return GoalTask(self.gain, saturation=Saturation(shape, self._limits, self.gain * self.dead_zone))
+        saturation = Saturation(shape, self._limits, gain * self.dead_zone)
+        return GoalTask(gain, saturation=saturation, gain_error=error)
 
 
 class UnknownGainGoalConfig(_Task):

@@ -74,6 +74,8 @@ class ObservationModel:
                 raise InputError("barriers", "barriers with known parameters (or a SafetyObserver)", barrier)
         if self.kind == "critical_region" and self.task.saturation is not None:
             raise InputError("kind", "inverse_optimal, since the nominal control is clipped", self.kind)
+        if self.kind == "critical_region" and getattr(self.task, "uncertain", False):
+            raise InputError("kind", "inverse_optimal, since the task is not known exactly", self.kind)
         if not self.active_tolerance > 0:
             raise InputError("active_tolerance", "a positive speed [m/s]", self.active_tolerance)
 
@@ -169,8 +171,8 @@ def evidence(
 
     Args:
         model: the declared model.
-        theta: the robots' sets so far, batch (B,). They are used only for clipped nominal controls, and for position
-            errors of tasks with an unknown gain.
+        theta: the robots' sets so far, batch (B,). They are used only for clipped nominal controls, for tasks that are
+            not known exactly, and for position errors of tasks with an unknown gain.
         measurement: a measurement of these robots, or several concatenated.
         compiled: whether to run compiled code instead of torch. None chooses compiled code wherever it is possible:
             controls and theta are planar, nothing is clipped, no gradient is needed, and tensors are on the CPU.
@@ -208,10 +210,13 @@ def _sample(model: ObservationModel, theta: FeasibleSet, measurement: Measuremen
         bound, ball = bound + measurement.velocity_error.unsqueeze(-1), ball + measurement.velocity_error
     largest = bound.squeeze(-1)  # slack of an active row whose position is exact
     errors, of_rows, corners = ErrorBounds.of(measurement, model.noise), None, None
-    if errors is not None or model.task.saturation is not None:
+    uncertain = getattr(model.task, "uncertain", False)
+    if errors is not None or model.task.saturation is not None or uncertain:
         corners = theta.vertices().repeat(items // max(robots, 1), 1, 1)
         if errors is not None:
             drift = model.task.drift(errors, corners.abs().amax(-2))
+        if uncertain:
+            drift = drift + model.task.uncertainty(measurement, corners)  # type: ignore[attr-defined]
     if errors is None and any(getattr(barrier, "uncertain", False) for barrier in model.barriers):
         errors = ErrorBounds.none(measurement)
     if errors is not None:

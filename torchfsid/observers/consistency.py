@@ -127,7 +127,7 @@ class Consistency:
         """
         wanted = torch.ones(self.robots, dtype=torch.bool) if wanted is None else wanted
         theta, psi, fits = self.prior, self.psi, torch.ones(self.robots, dtype=torch.bool)
-        rereads = self.task.saturation is not None or psi is not None
+        rereads = self.task.saturation is not None or psi is not None or getattr(self.task, "uncertain", False)
         while True:
             before = theta.volume()
             for block in self.blocks:

@@ -133,6 +133,11 @@ class SafetyObserver:
         return len(self._of) > self.robots
 
     @property
+    def team_is_refuted(self) -> bool:
+        """Was it found that the robots have no safety parameters in common?"""
+        return any(refutation.robot is None for refutation in self.refutations)
+
+    @property
     def events(self) -> list[Event]:
         """The first ALARM and INCONSISTENT of each robot, and the times at which sets were reset."""
         return [event for event in self._events if event.robot < self.robots]
@@ -165,7 +170,7 @@ class SafetyObserver:
         self._skipped = self._skipped + ~read.evidence.informative
         evidence, shown = read.evidence, torch.arange(self.robots)
         if self.is_shared:
-            if any(refutation.robot is None for refutation in self.refutations):
+            if self.team_is_refuted:
                 shown = shown + self.robots
                 self._fall_back()
             evidence, informative = evidence.select(shown), informative[shown]
@@ -187,7 +192,7 @@ class SafetyObserver:
         t = measurements[-1].time
         if self.is_shared:
             self._look(torch.arange(self.robots), 0, measurements, t, most)
-            if any(refutation.robot is None for refutation in self.refutations):
+            if self.team_is_refuted:
                 self._fall_back()
         if not self.is_shared:
             for robot in (self._status < Status.INCONSISTENT).nonzero().flatten().tolist():
@@ -219,7 +224,7 @@ class SafetyObserver:
 
     def odd(self) -> list[int]:
         """The robots without whom all others can have the same parameters. Empty if there is none, or no need."""
-        if self.is_shared or not any(refutation.robot is None for refutation in self.refutations):
+        if not self.team_is_refuted:
             return []
         found, trusted = [], (self.status < Status.INCONSISTENT).tolist()
         facets = self.safety.facets().halfspaces

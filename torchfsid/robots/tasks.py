@@ -60,6 +60,12 @@ class Saturation:
 class Task(Protocol):
     """A nominal control uhat = C theta + d, clipped if `saturation` is not None.
 
+    Two more members are optional, for tasks that are not known exactly:
+
+        uncertain                           whether this one is not.
+        uncertainty(measurement, corners)   (*batch): a bound on the error of C theta + d [m/s], for theta in the hull
+                                            of the corners (*batch, v, p).
+
     `parameter_names` holds the names of the p entries of theta. `task(measurement)` returns C (*batch, n, p) and
     d (*batch, n).
     """
@@ -88,20 +94,34 @@ def _identity_like(x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n n"]:
 
 @dataclass(frozen=True)
 class GoalTask:
-    """Go to a goal: uhat = gain (theta - x), theta the goal [m], gain [1/s] (G., Sec. III)."""
+    """Go to a goal: uhat = gain (theta - x), theta the goal [m], gain [1/s] (G., Sec. III).
+
+    The gain may be wrong by at most `gain_error` [1/s].
+    """
 
     gain: float | Tensor
     parameter_names: tuple[str, ...] = ("goal_x", "goal_y")
     saturation: Saturation | None = None
+    gain_error: float = 0.0
 
     def __post_init__(self) -> None:
         _positive("gain", self.gain)
+        if not self.gain_error >= 0:
+            raise InputError("gain_error", "a bound >= 0 [1/s]", self.gain_error)
+
+    @property
+    def uncertain(self) -> bool:
+        return self.gain_error > 0
+
+    def uncertainty(self, measurement: Measurement, corners: Float[Tensor, "*batch v p"]) -> Float[Tensor, "*batch"]:
+        """`gain_error` times the largest distance to a possible goal [m/s]."""
+        return self.gain_error * (corners - measurement.x.unsqueeze(-2)).norm(dim=-1).amax(-1)
 
     def __call__(self, measurement: Measurement) -> Affine:
         return self.gain * _identity_like(measurement.x), -self.gain * measurement.x
 
     def drift(self, bounds: ErrorBounds, largest: Tensor) -> Tensor:
-        return self.gain * bounds.position
+        return (self.gain + self.gain_error) * bounds.position
 
 
 @dataclass(frozen=True)
