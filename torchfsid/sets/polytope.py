@@ -21,11 +21,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchfsid.halfspaces import Halfspaces, array
+from torchfsid.kernels import extent
 from torchfsid.outcome import Outcome, ProgrammeStatus
 from torchfsid.programmes.differentiable import inscribed_ball, nearest_point, times
-from torchfsid.sets import sensitivity
+from torchfsid.sets import derivatives, sensitivity
 from torchfsid.sets.body import PRIOR, Clipped, Contradiction
 from torchfsid.sets.cell import Cell, intersect, merged
+from torchfsid.sets.derivatives import at
 from torchfsid.sets.faces import Indices, Mask, Reals
 from torchfsid.sets.shape import FLAT, Shape
 from torchfsid.tolerances import ROUND_OFF
@@ -135,7 +137,7 @@ class Polytope:
     @property
     def vertices(self) -> Float[Tensor, "B V p"]:
         """The vertices. Where more than p facets meet, p of them decide the gradient, with directions far apart."""
-        return sensitivity.vertices(self.A, self.b, self.corners, self.shape) if self._differentiable else self.corners
+        return sensitivity.vertices(self.A, self.b, self.shape) if self._differentiable else self.corners
 
     def volume(self) -> Float[Tensor, "B"]:
         """The volume, or the length for p = 1. It is 0 for a flat set, whose width is lost in round-off."""
@@ -147,27 +149,35 @@ class Polytope:
 
     def diameter(self) -> Float[Tensor, "B"]:
         """The largest distance between two points of the set."""
-        apart = torch.cdist(self.corners, self.corners, compute_mode="donot_use_mm_for_euclid_dist").flatten(1)
-        furthest, at = apart.argmax(-1), torch.arange(len(apart), device=apart.device)
-        vertices, V = self.vertices, self.corners.shape[1]
-        return torch.linalg.vector_norm(vertices[at, furthest // V] - vertices[at, furthest % V], dim=-1)
+        ends, distance = (torch.from_numpy(part).to(self.A.device) for part in extent.farthest(array(self.corners)))
+        if not self._differentiable:
+            return distance
+        first, last = at(self.corners, ends).unbind(1)
+        along = torch.stack([first - last, last - first], dim=1)  # the directions in which the two are extreme
+        return derivatives.distance(distance, sensitivity.extreme(self.A, self.b, self.shape, ends, along))
 
     def support(self, direction: Float[Tensor, "B D p"]) -> Float[Tensor, "B D"]:
         """The support function h(n) = max n.z over the set, n the `direction`."""
-        values = direction @ self.vertices.transpose(1, 2)
-        return values.gather(-1, values.detach().argmax(-1, keepdim=True)).squeeze(-1)
+        furthest = (direction.detach() @ self.corners.mT).argmax(-1)
+        if not self._differentiable:
+            return (direction * at(self.corners, furthest)).sum(-1)
+        return (direction * sensitivity.extreme(self.A, self.b, self.shape, furthest, direction)).sum(-1)
 
     def chebyshev(self) -> tuple[Float[Tensor, "B p"], Float[Tensor, "B"]]:
         """Centre and radius of a largest inscribed ball: max r s.t. A_f.z + |A_f| r <= b_f.
 
         Where the centre is not unique, the one with the smallest z_1 is returned, among these the one with the smallest
         z_2, and so on. Its gradient is that of the p + 1 facets that decide this choice. The radius and its gradient
-        are right in any case. A flat set has the radius 0, and its centre is a point of the set.
+        are right in any case. A flat set has the radius 0, and its centre is a point of the set. Where no ball could be
+        verified as a largest one, it is the largest about a point of the set.
         """
-        ball = inscribed_ball(self._recentred)
-        flat = ball.radius <= FLAT * self.reach.amax(-1)
-        centre = self._middle + torch.where(flat.unsqueeze(-1), 0.0, ball.centre)
-        return centre, torch.where(flat, 0.0, ball.radius)
+        rows = self._recentred
+        centre, radius, status = inscribed_ball(rows)
+        flat, lost = radius <= FLAT * self.reach.amax(-1), status == ProgrammeStatus.UNSOLVED
+        if bool(lost.any()):
+            radius = torch.where(lost, rows.slack(torch.zeros_like(centre)).amin(-1).clamp(min=0.0), radius)
+        centre = self._middle + torch.where((flat | lost).unsqueeze(-1), 0.0, centre)
+        return centre, torch.where(flat, 0.0, radius)
 
     def nearest(
         self, point: Float[Tensor, "B p"], metric: Float[Tensor, "B p p"] | None = None
