@@ -70,7 +70,7 @@ def measures(body: Polytope, points: Tensor, directions: Tensor, factors: Tensor
         "volume": body.volume(), "centroid": body.centroid(), "vertices": body.vertices, "centre": centre,
         "radius": radius, "diameter": body.diameter(), "support": body.support(directions),
         "nearest": body.nearest(points), "nearest in a metric": body.nearest(points, metric(factors)),
-        "nearest to a point inside": body.nearest(0.01 * points), "A": body.A, "b": body.b,
+        "nearest to a point inside": body.nearest(0.01 * points), "A": body.rows()[0], "b": body.rows()[1],
     }  # fmt: skip
 
 
@@ -276,6 +276,24 @@ def test_where_no_gradient_is_required_there_is_none_and_numbers_do_not_depend_o
         assert not forbidden[name].requires_grad
         assert torch.equal(value, detached[name])
         assert torch.equal(value, forbidden[name])
+
+
+@pytest.mark.parametrize("p", [1, 3])
+def test_the_graph_has_the_size_of_the_facets(p: int) -> None:
+    """After 200 cuts. The gradient of the volume is that of scaling the set."""
+    rng, scale = np.random.default_rng(p), torch.ones((), dtype=torch.float64, requires_grad=True)
+    body = Polytope.from_box(*corners(p, 9.0, 2))
+    for k in range(200):
+        A = tensor(rng.normal(size=(2, 4, p)))
+        body = clipped(A, scale * A.norm(dim=-1) * 0.97**k, body)
+    volume = body.volume().sum()
+    nodes, found = [volume.grad_fn], set()
+    while nodes:
+        if (node := nodes.pop()) not in found:
+            found.add(node)
+            nodes += [before for before, _ in node.next_functions if before is not None]
+    assert len(found) <= 20 + 10 * int(body.count.sum())
+    assert torch.autograd.grad(volume, scale)[0].item() == pytest.approx(p * volume.item(), rel=1e-9)
 
 
 # Sets ---------------------------------------------------------------------------------------------------------------

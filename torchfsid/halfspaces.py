@@ -21,6 +21,9 @@ from torch import Tensor
 from torchfsid.errors import InputError
 from torchfsid.tolerances import ROUND_OFF
 
+LONG = 1e100
+"""Largest entry of rows that are not shortened."""
+
 
 @dataclass(frozen=True)
 class Halfspaces:
@@ -40,8 +43,8 @@ class Halfspaces:
     source: Int[Tensor, "*#batch m"] | None = None
 
     def __post_init__(self) -> None:
-        A, b = torch.as_tensor(self.A), torch.as_tensor(self.b)
-        if A.ndim < 2 or A.shape[-2] != b.shape[-1]:
+        A, b = reals("A", self.A), reals("b", self.b)
+        if A.ndim < 2 or A.shape[-2:-1] != b.shape[-1:]:
             raise InputError("Halfspaces(A, b)", "A (*batch, m, n) and b (*batch, m)", (tuple(A.shape), tuple(b.shape)))
         if A.shape[:-1] != b.shape:
             try:
@@ -49,8 +52,8 @@ class Halfspaces:
             except ValueError as error:
                 raise InputError("Halfspaces(A, b)", "equal batch shapes", (tuple(A.shape), tuple(b.shape))) from error
             A, b = A.expand(*batch, *A.shape[-2:]), b.expand(*batch, b.shape[-1])
-        object.__setattr__(self, "A", A.to(torch.float64))
-        object.__setattr__(self, "b", b.to(torch.float64))
+        object.__setattr__(self, "A", A)
+        object.__setattr__(self, "b", b)
         if self.source is not None and self.source.shape != b.shape:
             object.__setattr__(self, "source", self.source.expand(self.b.shape))
 
@@ -99,6 +102,13 @@ class Halfspaces:
         A, b, norms = self._scaled()
         return Halfspaces(A / norms.unsqueeze(-1), b / norms, self.source)
 
+    def shortened(self) -> Halfspaces:
+        """The same set, with rows scaled if a product of one with a point could overflow."""
+        if self.b.numel() == 0 or np.abs(array(self.A)).max(initial=0.0) < LONG:
+            return self
+        A, b, _ = self._scaled()
+        return Halfspaces(A, b, self.source)
+
     def slack(self, z: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch m"]:
         """(b_j - a_j.z)/|a_j|: the signed distance of z to each boundary, positive inside, in the units of z."""
         A, b, norms = self._scaled()
@@ -144,6 +154,18 @@ def _root_of_squares(rows: Tensor) -> Tensor:
     squared = dot(rows, rows)
     padding = squared == 0
     return torch.where(padding, 1.0, squared.masked_fill(padding, 1.0).sqrt())
+
+
+def reals(name: str, value: object) -> Tensor:
+    """The argument `name` as a tensor in float64. Gradients flow back through the cast.
+
+    Raises:
+        InputError: it is no tensor and cannot become one.
+    """
+    try:
+        return torch.as_tensor(value).to(torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(name, "a tensor of numbers", value) from error
 
 
 def finite(*tensors: Tensor) -> bool:

@@ -18,6 +18,7 @@ from experiments.runs.observers import Observers
 from experiments.runs.saved import SETS, Results
 from experiments.runs.summary import settings
 from experiments.tables import table
+from torchfsid.config.quantities import known
 
 LEARNED = 0.1
 """Share of the prior's standard deviation."""
@@ -44,7 +45,7 @@ def measure_cases(results: Results, observers: Observers) -> dict[str, Any]:
 def _measure(i: int, results: Results, observers: Observers) -> dict[str, Any]:
     config, tally = observers.config, observers.tally
     assert isinstance(config, CasesConfig)
-    case, duration = config.cases[i], config.dt * tally.samples
+    case, duration, gain = config.cases[i], config.dt * tally.samples, known(config.task.gain) or 0.0
     information_rank = int(torch.linalg.matrix_rank(tally.information[i], atol=RANK_TOLERANCE * gain**2 * duration))
     error = results.error("ukf_0", "ukf_1")[:, i]
     prior_error = np.linalg.norm((np.array(config.prior.lower) + config.prior.upper) / 2 - config.goal)

@@ -78,7 +78,7 @@ def narrowed(declared: DeclaredLog) -> tuple[DeclaredLog, TaskGain]:
         middle = (low * high) ** 0.5
         halves = [(low, middle), (middle, high)]
         for half in halves if first else reversed(halves):
-            if (found := end(*half, first)) is not None:
+            if (found := end(half[0], half[1], first)) is not None:
                 return found
         return None
 

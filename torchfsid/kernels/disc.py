@@ -116,6 +116,7 @@ def inscribed(vertices, A, b, count):
                 norm = math.hypot(A[k, i, 0], A[k, i, 1])
             rows[i, 0], rows[i, 1] = A[k, i, 0] / norm, A[k, i, 1] / norm
             right[i] = (b[k, i] - A[k, i, 0] * x - A[k, i, 1] * y) / norm
-        step_x, step_y, radius[k], found[k] = inscribed_in(rows, right, n, basis[k], weight, turned)
+        step_x, step_y, r, found[k] = inscribed_in(rows, right, n, basis[k], weight, turned)
+        radius[k] = max(r, 0.0)  # that of a flat set may be negative by round-off
         centre[k, 0], centre[k, 1] = x + step_x, y + step_y
     return centre, radius, basis, found

@@ -19,20 +19,30 @@ from torchfsid.outcome import ProgrammeStatus
 OK, EMPTY, UNDEFINED = int(ProgrammeStatus.OK), int(ProgrammeStatus.EMPTY), int(ProgrammeStatus.UNDEFINED)
 
 SHORT, LONG = 1e-100, 1e100
-"""Largest entries of rows that need no scaling."""
+"""Largest numbers that need no scaling."""
+
+
+@item
+@no_type_check
+def power_of_two(largest):
+    """The power of two that scales numbers up to `largest` exactly, so that their squares do not over- or underflow.
+
+    It is 1 for most numbers.
+    """
+    if SHORT < largest < LONG or largest == 0.0 or not largest < np.inf:
+        return 1.0
+    _, exponent = math.frexp(largest)
+    return math.ldexp(1.0, min(1 - exponent, 1023))
 
 
 @item
 @no_type_check
 def scale_of(A, row):
-    """The power of two that scales a row exactly, so that its squares do not over- or underflow; 1 for most rows."""
+    """The `power_of_two` of a row."""
     largest = 0.0
     for j in range(A.shape[1]):
         largest = max(largest, abs(A[row, j]))
-    if SHORT < largest < LONG or largest == 0.0 or not largest < np.inf:
-        return 1.0
-    _, exponent = math.frexp(largest)
-    return math.ldexp(1.0, min(1 - exponent, 1023))
+    return power_of_two(largest)
 
 
 @item

@@ -11,6 +11,9 @@ Where safety parameters are unknown, the filter takes the typical ones of Psi.
 The set does not depend on the filter. Where P is no longer a covariance, the projection is Euclidean. Where the
 filter's estimate is not finite, or so far away that its projection has no accurate digits, the centroid of the set
 replaces it. `status` reports both.
+
+Gradients flow through the set and the projection. The filter's mean and covariance count as constants, so with feedback
+the gradient leaves out what earlier projections changed in the filter.
 """
 
 from __future__ import annotations

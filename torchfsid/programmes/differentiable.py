@@ -52,7 +52,7 @@ def nearest_point(
     """The point of each set nearest to `point` in the norm sqrt(z' metric z) (default: Euclidean). Batches broadcast.
 
     Raises:
-        InputError: dimensions or batches do not fit.
+        InputError: dimensions or batches do not fit, or p = 0.
     """
     found, _, _, _, status = nearest(*broadcast(halfspaces, point, metric))
     return NearestPoint(found.to(point.dtype), status)
@@ -74,6 +74,9 @@ def inscribed_ball(halfspaces: Halfspaces) -> InscribedBall:
     Where the centre is not unique, the one with the smallest z_1 is returned, among these the one with the smallest
     z_2, and so on. Its gradient is that of the rows that decide this choice. The radius and its gradient are right in
     any case.
+
+    Raises:
+        InputError: p = 0.
     """
     halfspaces, *_ = broadcast(halfspaces)
     centre, radius, _, status = _InscribedBall.apply(halfspaces.A, halfspaces.b)  # type: ignore[misc]
@@ -85,6 +88,8 @@ def broadcast(
 ) -> tuple[Halfspaces, Any, Any]:
     """Half-spaces, point and metric in float64 with one batch shape. The half-spaces get a row if they have none."""
     p = halfspaces.dim
+    if p == 0:
+        raise InputError("halfspaces", "rows (*batch, m, p) with p >= 1", tuple(halfspaces.A.shape))
     if halfspaces.rows == 0:
         A, b = halfspaces.A, halfspaces.b
         halfspaces = Halfspaces(A.new_zeros(*A.shape[:-2], 1, p), b.new_ones(*b.shape[:-1], 1))

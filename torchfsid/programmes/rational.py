@@ -27,6 +27,16 @@ def nearest_point(A: Array, b: Array, y: Array, H: Array, z: Array, mu: Array, r
     Returns:
         Its `ProgrammeStatus`.
     """
+    try:
+        status = _nearest_point(A, b, y, H, z, mu, rows, filled)
+    except OverflowError:  # a rational number is beyond all floats
+        status = kernel.UNSOLVED
+    if status != kernel.OK:
+        z[:], mu[:], rows[:], filled[:] = np.nan, 0.0, 0, False
+    return status
+
+
+def _nearest_point(A: Array, b: Array, y: Array, H: Array, z: Array, mu: Array, rows: Array, filled: Array) -> int:
     scale, (m, p) = powers_of_two(A), A.shape
     A, b = A * scale[:, None], b * scale
     unit, offsets, sizes, lengths, L = np.empty((m, p)), np.empty(m), np.empty(m), np.empty((m, 2)), np.zeros((p, p))
@@ -47,8 +57,6 @@ def nearest_point(A: Array, b: Array, y: Array, H: Array, z: Array, mu: Array, r
             A, b, y, L, metric, unit, sizes, lengths, rows, k, *scratch, x.astype(float), z, mu
         )
     mu[:k] *= scale[rows[:k]]
-    if status != kernel.OK:
-        z[:], mu[:], rows[:], filled[:] = np.nan, 0.0, 0, False
     return status
 
 
@@ -58,6 +66,13 @@ def inscribed_ball(A: Array, b: Array, simplex: Array, centre: Array, rows: Arra
     Returns:
         The radius and the `ProgrammeStatus`.
     """
+    try:
+        return _inscribed_ball(A, b, simplex, centre, rows)
+    except OverflowError:
+        return kernel.write_ball(np.zeros(len(simplex)), len(b), kernel.UNSOLVED, centre, rows)
+
+
+def _inscribed_ball(A: Array, b: Array, simplex: Array, centre: Array, rows: Array) -> tuple[float, int]:
     scale, (m, p), n = powers_of_two(A), A.shape, A.shape[1] + 1
     A, b = A * scale[:, None], b * scale
     unit, offsets, sizes, lengths = np.ones((m, n)), np.empty(m), np.empty(m), np.empty((m, 2))

@@ -73,6 +73,11 @@ class Body(Protocol):
         ...
 
     @property
+    def corners(self) -> Float[Tensor, "B V p"]:
+        """The vertices without gradients, padded by repeating the first one."""
+        ...
+
+    @property
     def vertices(self) -> Float[Tensor, "B V p"]:
         """The vertices, padded by repeating the first one."""
         ...

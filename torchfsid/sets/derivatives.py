@@ -24,7 +24,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchfsid.halfspaces import dot
+from torchfsid.halfspaces import dot, lengths
 
 
 class Skeleton(NamedTuple):
@@ -138,6 +138,12 @@ def solution(
     else:
         step = torch.linalg.solve(M, residual)
     return number + (step - step.detach())
+
+
+def distance(number: Float[Tensor, "B"], ends: Float[Tensor, "B 2 p"]) -> Float[Tensor, "B"]:
+    """`number` with the derivatives of the distance between two points, which it equals. Constant where it is 0."""
+    between = lengths(ends[:, 0] - ends[:, 1])
+    return number + torch.where(number > 0, between - between.detach(), 0.0)
 
 
 def at(table: Tensor, index: Int[Tensor, "B *K"]) -> Tensor:

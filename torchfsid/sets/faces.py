@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from torchfsid.tolerances import PARALLEL_ROWS
 
@@ -103,18 +104,21 @@ def _simplices(incident: Mask, p: int) -> tuple[Indices, Indices]:
     return np.column_stack([corners, base[face]]), facet
 
 
-def bases(rows: Reals, incident: Mask) -> tuple[Indices, Mask]:
+def bases(rows: Reals, incident: Mask, needed: Mask | None = None) -> tuple[Indices, Mask]:
     """For each vertex, p independent facets that meet in it (B, V, p), and whether there are p of them (B, V).
 
-    `rows` (B, F, p) are the facets' normals, of length 1 or 0. Where more than p facets meet, the facet whose normal is
-    furthest from the span of those already taken is taken next. A facet within `PARALLEL_ROWS` [rad] of it is not
-    taken.
+    `rows` (B, F, p) are the facets' normals, of length 1 or 0. Where more than p facets meet, those marked by `needed`
+    (B, V, F) are taken first. Of these, and then of the others, the facet whose normal is furthest from the span of
+    those already taken is taken next. A facet within `PARALLEL_ROWS` [rad] of it is not taken.
     """
     (B, V, _), p = incident.shape, rows.shape[2]
     chosen, enough = np.zeros((B, V, p), dtype=np.int64), np.ones((B, V), dtype=bool)
     left = np.where(incident[..., None], rows[:, None], 0.0)
     for k in range(p):
         lengths = np.linalg.norm(left, axis=-1)
+        if needed is not None:
+            first = needed & (lengths > PARALLEL_ROWS)
+            lengths = np.where(first.any(-1, keepdims=True), np.where(first, lengths, 0.0), lengths)
         chosen[..., k] = lengths.argmax(-1)
         length = np.take_along_axis(lengths, chosen[..., k, None], axis=-1)
         enough &= length[..., 0] > PARALLEL_ROWS
@@ -122,6 +126,23 @@ def bases(rows: Reals, incident: Mask) -> tuple[Indices, Mask]:
         along = along / np.where(length > 0, length, 1.0)[..., None]
         left -= (left @ along.swapaxes(-1, -2)) * along
     return chosen, enough
+
+
+def optimal_bases(rows: Reals, incident: Mask, directions: Reals) -> tuple[Indices, Mask]:
+    """`bases` of vertices that are extreme in `directions` (B, V, p), with multipliers >= 0.
+
+    Such a direction d is a combination of the normals of the facets that meet in the vertex, with weights y >= 0: the
+    multipliers of the linear programme max d.z. The facets with y > 0 belong to the basis.
+    """
+    needed = np.zeros_like(incident)
+    for i, v in np.argwhere((incident.sum(2) > rows.shape[2]) & np.isfinite(directions).all(2)):
+        at, length = np.flatnonzero(incident[i, v]), np.linalg.norm(directions[i, v])
+        try:
+            y, _ = nnls(rows[i, at].T, directions[i, v] / (length if length > 0 else 1.0))
+        except RuntimeError:  # the search stalled: any facets
+            continue
+        needed[i, v, at] = y > 0
+    return bases(rows, incident, needed)
 
 
 def _parts(incident: Mask, p: int) -> list[slice]:

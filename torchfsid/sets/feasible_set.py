@@ -25,12 +25,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchfsid.errors import InputError
-from torchfsid.halfspaces import Halfspaces, finite
+from torchfsid.halfspaces import Halfspaces, array, finite, reals
+from torchfsid.kernels import extent
 from torchfsid.outcome import Outcome
 from torchfsid.programmes.differentiable import inscribed_ball, symmetric
 from torchfsid.sets.polygon import Polygon
 from torchfsid.sets.polytope import Polytope
-from torchfsid.tolerances import ROUND_OFF
 
 MAX_FACETS = 32
 """Facets kept; more are merged outward. Costs below 1 % of the volume (tests/test_feasible_set.py)."""
@@ -86,11 +86,11 @@ class FeasibleSet:
         """The prior Theta_0 = [lower, upper].
 
         Raises:
-            InputError: shapes differ, lower < upper fails somewhere, the box is not bounded, or `max_facets` are too
-                few to bound a set.
+            InputError: shapes differ, p = 0, lower < upper fails somewhere, the box is not bounded, or `max_facets` are
+                too few to bound a set.
         """
-        lower, upper = torch.as_tensor(lower).to(torch.float64), torch.as_tensor(upper).to(torch.float64)
-        if lower.shape != upper.shape or lower.ndim == 0:
+        lower, upper = reals("lower", lower), reals("upper", upper)
+        if lower.shape != upper.shape or lower.ndim == 0 or lower.shape[-1] == 0:
             raise InputError("lower, upper", "two tensors (*batch, p)", (tuple(lower.shape), tuple(upper.shape)))
         if not bool((lower < upper).all()):
             raise InputError("lower, upper", "lower < upper in every coordinate", (lower.tolist(), upper.tolist()))
@@ -125,7 +125,7 @@ class FeasibleSet:
     @cached_property
     def any_empty(self) -> bool:
         """Is any of the sets empty?"""
-        return bool(self.is_empty.any())
+        return bool((array(self.outcome) == Outcome.EMPTY).any())
 
     def intersect(
         self,
@@ -149,6 +149,7 @@ class FeasibleSet:
             raise InputError("halfspaces", "finite rows", "NaN or infinity")
         if m == 0:
             return self
+        halfspaces = halfspaces.shortened()
         if self.any_empty:
             halfspaces = halfspaces.where(~self.is_empty.unsqueeze(-1))
         source = torch.arange(m, device=self.outcome.device) if halfspaces.source is None else halfspaces.source
@@ -187,8 +188,17 @@ class FeasibleSet:
             last_cut=torch.where(mask, self.last_cut, other.last_cut),
         )
 
-    def select(self, items: Int[Tensor, "k"]) -> FeasibleSet:
-        """The sets at the places `items` of a batch (B,). A place may occur more than once."""
+    def select(self, items: Int[Tensor, "k"] | Bool[Tensor, "B"]) -> FeasibleSet:
+        """The sets at the places `items` of a batch (B,), or where the mask `items` is True. A place may occur twice.
+
+        Raises:
+            InputError: there is no batch, or no such place.
+        """
+        try:
+            items = torch.arange(len(self.outcome), device=self.outcome.device)[items]
+        except (IndexError, TypeError) as error:
+            expected = f"places in, or a mask of, a batch (B,) of sets, here {tuple(self.batch_shape)}"
+            raise InputError("items", expected, items) from error
         against = self.contradiction
         rows = Halfspaces(against.halfspaces.A[items], against.halfspaces.b[items])
         return replace(
@@ -220,12 +230,13 @@ class FeasibleSet:
         Raises:
             InputError: theta is not (*batch, p).
         """
-        self._check("theta", theta, (self.dim,), broadcast=True)
-        with torch.no_grad():
-            round_off = ROUND_OFF * (theta.abs().amax(-1) + 2 * self._batched(self.body.reach).sum(-1))
-            margin = tolerance * self._batched(self.body.diameter()) + round_off
-            inside = self.facets().halfspaces.slack(theta) >= -margin.unsqueeze(-1)
-        return inside.all(-1) & ~self.is_empty
+        batch, p = self.batch_shape, self.dim
+        points = self._given("theta", theta, (p,), broadcast=True).detach()
+        points = points.expand(torch.broadcast_shapes(points.shape, (*batch, p)))
+        shape = points.shape[: points.ndim - 1 - len(batch)].numel(), batch.numel(), p
+        sets = self.body.corners, self.body.A, self.body.b, self.body.reach
+        inside = torch.from_numpy(extent.contains(*map(array, sets), array(points.reshape(shape)), tolerance))
+        return inside.to(self.outcome.device).reshape(points.shape[:-1]) & ~self.is_empty
 
     def volume(self) -> Float[Tensor, "*batch"]:
         """The length for p = 1, the area in the plane, the volume for p >= 3. 0 for an EMPTY item."""
@@ -258,8 +269,7 @@ class FeasibleSet:
         Raises:
             InputError: direction is not (*batch, p).
         """
-        self._check("direction", direction, (self.dim,))
-        flat = self._flat(direction.to(torch.float64), (self.dim,))
+        flat = self._flat(self._given("direction", direction, (self.dim,)), (self.dim,))
         return self._unless_empty(self.body.support(flat.unsqueeze(1)).squeeze(-1))
 
     def project(
@@ -274,12 +284,10 @@ class FeasibleSet:
             InputError: point is not (*batch, p), or metric is not (*batch, p, p).
         """
         p = self.dim
-        self._check("point", point, (p,))
-        flat = self._flat(point.to(torch.float64), (p,))
+        flat = self._flat(self._given("point", point, (p,)), (p,))
         known = flat.isfinite().all(-1)
         if metric is not None:
-            self._check("metric", metric, (p, p))
-            metric = self._flat(symmetric(metric.to(torch.float64)), (p, p))
+            metric = self._flat(symmetric(self._given("metric", metric, (p, p))), (p, p))
             known = known & metric.isfinite().all((-1, -2))
             identity = torch.eye(p, dtype=metric.dtype, device=metric.device)
             _, fault = torch.linalg.cholesky_ex(torch.where(known[:, None, None], metric, identity).detach())
@@ -302,8 +310,9 @@ class FeasibleSet:
             return answer
         return torch.where(self.is_empty.reshape((*self.batch_shape, *[1] * (flat.ndim - 1))), instead, answer)
 
-    def _check(self, name: str, value: Tensor, shape: tuple[int, ...], broadcast: bool = False) -> None:
-        """Raise `InputError` unless `value` holds one item of `shape` per set. With `broadcast` it may hold several."""
+    def _given(self, name: str, value: Tensor, shape: tuple[int, ...], broadcast: bool = False) -> Tensor:
+        """The value in float64. It must hold one item of `shape` per set. With `broadcast` it may hold several."""
+        value = reals(name, value)
         batch, inner = value.shape[: value.ndim - len(shape)], tuple(value.shape[value.ndim - len(shape) :])
         fits = inner == shape and _fits(
             batch[max(0, len(batch) - len(self.batch_shape)) if broadcast else 0 :], self.batch_shape
@@ -312,6 +321,7 @@ class FeasibleSet:
             raise InputError(
                 name, f"(*batch, {', '.join(map(str, shape))}), batch {tuple(self.batch_shape)}", tuple(value.shape)
             )
+        return value
 
     def _flat(self, rows: Tensor, shape: tuple[int, ...]) -> Tensor:
         """One item of `shape` for each set, with the batch flattened."""

@@ -20,11 +20,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchfsid.halfspaces import array
-from torchfsid.kernels import disc, foot
+from torchfsid.halfspaces import Halfspaces, array
+from torchfsid.kernels import disc, extent, foot
 from torchfsid.kernels import polygon as kernel
 from torchfsid.outcome import ProgrammeStatus
-from torchfsid.programmes import exact
+from torchfsid.programmes.differentiable import inscribed_ball
 from torchfsid.sets import derivatives
 from torchfsid.sets.body import PRIOR, Clipped, Contradiction
 from torchfsid.sets.derivatives import Skeleton, at
@@ -177,12 +177,8 @@ class Polygon:
 
     def diameter(self) -> Float[Tensor, "B"]:
         """The largest distance between two points of the set."""
-        apart = (self.corners.unsqueeze(1) - self.corners.unsqueeze(2)).square().sum(-1).flatten(1)
-        ends = apart.argmax(-1, keepdim=True)
-        vertices = self.vertices
-        between = (at(vertices, ends // self.slots) - at(vertices, ends % self.slots)).squeeze(1)
-        squared = between.square().sum(-1)
-        return torch.where(squared > 0, squared.clamp(min=1e-300).sqrt(), 0.0)
+        ends, distance = (torch.from_numpy(part).to(self.b.device) for part in extent.farthest(array(self.corners)))
+        return derivatives.distance(distance, at(self.vertices, ends)) if self._differentiable() else distance
 
     def support(self, direction: Float[Tensor, "B D 2"]) -> Float[Tensor, "B D"]:
         """The support function h(n) = max n.z over the set. Tied vertices give the derivatives of the first one."""
@@ -194,15 +190,17 @@ class Polygon:
 
         Where the centre is not unique (two parallel edges touch the disc), an end of the segment of centres is
         returned. Its gradient is that of the three rows that decide this choice. The radius and its gradient are right
-        in any case.
+        in any case. Where no disc could be verified as a largest one, it is the largest about a point of the set.
         """
         numbers = disc.inscribed(*map(array, (self.corners, self.A, self.b, self.count)))
-        centre, radius, rows, found = (torch.from_numpy(part).to(self.b.device) for part in numbers)
-        if not bool(found.all()):
-            lost = (~found).nonzero().squeeze(-1)
+        centre, radius = (torch.from_numpy(part).to(self.b.device) for part in numbers[:2])
+        if not numbers[3].all():
+            lost = torch.from_numpy((~numbers[3]).nonzero()[0]).to(self.b.device)
             centre[lost], radius[lost] = self.select(lost)._disc_by_programme()
-        if self._differentiable():
-            centre, radius = derivatives.inscribed_ball(*self.rows(), centre, radius, rows, found)
+        if not self._differentiable():
+            return centre, radius
+        rows, found = (torch.from_numpy(part).to(self.b.device) for part in numbers[2:])
+        centre, radius = derivatives.inscribed_ball(*self.rows(), centre, radius, rows, found)
         return centre, torch.where(radius > 0, radius, 0.0)
 
     def nearest(
@@ -267,12 +265,12 @@ class Polygon:
     def _disc_by_programme(self) -> tuple[Float[Tensor, "B 2"], Float[Tensor, "B"]]:
         """The inscribed disc by `programmes.inscribed_ball`, which works in any dimension."""
         centre = self.corners.mean(1)
-        offsets = self.b - (self.A @ centre.unsqueeze(-1)).squeeze(-1)
-        step, radius, _, status = map(torch.from_numpy, exact.inscribed_ball(array(self.A), array(offsets)))
-        ok = (status == ProgrammeStatus.OK).to(centre.device)
-        step, radius = step.to(centre.device), radius.to(centre.device)
+        rows = Halfspaces(self.A, self.b - (self.A @ centre.unsqueeze(-1)).squeeze(-1))
+        step, radius, status = inscribed_ball(rows)
+        ok, lost = status == ProgrammeStatus.OK, status == ProgrammeStatus.UNSOLVED
+        about = torch.where(lost, rows.slack(torch.zeros_like(centre)).amin(-1), 0.0)
         # Where there is no disc, the set is flat to round-off.
-        return centre + torch.where(ok.unsqueeze(-1), step, 0.0), torch.where(ok, radius, 0.0)
+        return centre + torch.where(ok.unsqueeze(-1), step, 0.0), torch.where(ok, radius, about)
 
 
 def independent(v: Float[Tensor, "*B 2"], w: Float[Tensor, "*B 2"]) -> Bool[Tensor, "*B"]:

@@ -2,15 +2,15 @@ r"""Batched convex polytopes: the sets of parameters in other dimensions than th
 
 They have the interface of `polygon`. Searches run in numpy, without gradients. `cell` finds the facets that are left
 after a clip, `shape` finds volume and centroid, `programmes` finds the nearest point and the inscribed ball. Every
-facet is one of the given rows and carries its gradient. Vertices, volume, centroid, ball and nearest point are twice
-differentiable functions of the facets. A point is removed only if it is outside beyond round-off: every set is an outer
-set.
+facet is one of the given rows, whose gradient `provenance` keeps. Vertices, volume, centroid, ball and nearest point
+are twice differentiable functions of the facets. A point is removed only if it is outside beyond round-off: every set
+is an outer set.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from math import nan
 from typing import NamedTuple
@@ -21,12 +21,15 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchfsid.halfspaces import Halfspaces, array
+from torchfsid.kernels import extent
 from torchfsid.outcome import Outcome, ProgrammeStatus
 from torchfsid.programmes.differentiable import inscribed_ball, nearest_point, times
-from torchfsid.sets import sensitivity
+from torchfsid.sets import derivatives, sensitivity
 from torchfsid.sets.body import PRIOR, Clipped, Contradiction
 from torchfsid.sets.cell import Cell, intersect, merged
+from torchfsid.sets.derivatives import at
 from torchfsid.sets.faces import Indices, Mask, Reals
+from torchfsid.sets.provenance import Sheets
 from torchfsid.sets.shape import FLAT, Shape
 from torchfsid.tolerances import ROUND_OFF
 
@@ -36,26 +39,31 @@ class Polytope:
     """A batch of bounded convex polytopes {z : A z <= b} in R^p, float64.
 
     Attributes:
-        A: the facets' rows, padded with 0.z <= 1.
-        b: their right-hand sides. A row that only touched the set has been moved outward by its round-off.
+        A: the facets' rows, without gradients, padded with 0.z <= 1.
+        b: their right-hand sides, without gradients. A row that only touched the set has been moved outward by its
+            round-off.
         time: the time when each facet came [s]; NaN for the facets of the prior.
         source: the constraint that each facet came from; `PRIOR` for the facets of the prior.
+        label: the place of each facet's row in `sheets`; 0 if it has no gradient.
         count: the number of real facets.
         corners: the vertices, without gradients, padded with copies of the first one.
         incident: which vertex is on which facet. Padding is on none.
         vertex_count: the number of real vertices.
         reach: the largest |coordinates| that the set ever had, to which its round-off is proportional.
+        sheets: the rows with gradients.
     """
 
     A: Float[Tensor, "B F p"]
     b: Float[Tensor, "B F"]
     time: Float[Tensor, "B F"]
     source: Int[Tensor, "B F"]
+    label: Int[Tensor, "B F"]
     count: Int[Tensor, "B"]
     corners: Float[Tensor, "B V p"]
     incident: Bool[Tensor, "B V F"]
     vertex_count: Int[Tensor, "B"]
     reach: Float[Tensor, "B p"]
+    sheets: Sheets = field(default_factory=Sheets)
 
     @classmethod
     def from_box(cls, lower: Float[Tensor, "B p"], upper: Float[Tensor, "B p"]) -> Polytope:
@@ -63,9 +71,13 @@ class Polytope:
         B, p = lower.shape
         unit, b = torch.eye(p, dtype=lower.dtype, device=lower.device), torch.cat([-lower, upper], dim=-1)
         A, nothing = torch.cat([-unit, unit]).expand(B, 2 * p, p), torch.full_like(b, nan)
-        rows = _Rows.join((A, b, nothing, torch.full_like(b, PRIOR).long()))
+        label, sheets = torch.zeros_like(b).long(), Sheets()
+        if torch.is_grad_enabled() and b.requires_grad:
+            label = 1 + torch.arange(b.numel(), device=b.device).reshape(b.shape)
+            sheets = sheets.with_sheet(A.flatten(0, 1), b.flatten())
+        rows = _Rows.join((A, b.detach(), nothing, torch.full_like(label, PRIOR), label))
         boxes = [Cell.box(low, high) for low, high in zip(array(lower), array(upper), strict=True)]
-        return cls._of(boxes, list(np.arange(b.numel()).reshape(b.shape)), rows)
+        return cls._of(boxes, list(np.arange(b.numel()).reshape(b.shape)), rows, sheets)
 
     @property
     def dim(self) -> int:
@@ -78,15 +90,16 @@ class Polytope:
 
     def select(self, items: Tensor) -> Polytope:
         """The sub-batch at `items` (indices or a mask)."""
-        chosen, origins = self._positions(items), self._origins()
-        return self._of([self._cells[i] for i in chosen], [origins[i] for i in chosen], _Rows.join(self._rows()))
+        chosen, origins, rows = self._positions(items), self._origins(), _Rows.join(self._rows())
+        return self._of([self._cells[i] for i in chosen], [origins[i] for i in chosen], rows, self.sheets)
 
     def replaced(self, items: Tensor, other: Polytope) -> Polytope:
         """This batch with the polytopes of `other` at the places `items` (indices or a mask)."""
         cells, origins, others = list(self._cells), self._origins(), other._origins(first=self.b.numel())
         for i, cell, origin in zip(self._positions(items), other._cells, others, strict=True):
             cells[i], origins[i] = cell, origin
-        return self._of(cells, origins, _Rows.join(self._rows(), other._rows()))
+        sheets, label = self.sheets.joined(other.sheets, other.label)
+        return self._of(cells, origins, _Rows.join(self._rows(), (*other._rows()[:-1], label)), sheets)
 
     def clip(
         self,
@@ -111,10 +124,18 @@ class Polytope:
             # Where merging costs more than the cut has gained, the polytope stays as it was.
             if cell is found.cell or cell.content <= cells[i].content:
                 cells[i], origins[i], shrunk[i] = cell, place[found.origin[kept]], True
-        table = _Rows.join(self._rows(), (A, b, time, source))
+        label, sheets = torch.zeros_like(source), self.sheets
+        if torch.is_grad_enabled() and (A.requires_grad or b.requires_grad) and shrunk.any():
+            used = np.unique(np.concatenate(origins))
+            entered = torch.from_numpy(used[used >= B * F] - B * F).to(device)
+            labels = 1 + sheets.rows + torch.arange(len(entered), device=device)
+            label = label.flatten().index_copy(0, entered, labels).reshape(B, R)
+            sheets = sheets.with_sheet(A.flatten(0, 1).index_select(0, entered), b.flatten().index_select(0, entered))
+        fresh = A.detach(), b.detach(), time, source, label
+        table = _Rows.join(self._rows(), fresh)
         outcomes, cut, conflict = (torch.as_tensor(field, device=device) for field in (outcome, shrunk, against))
-        contradiction = Contradiction(*(field.detach() for field in table.at(conflict, nan, nan)))
-        return Clipped(self._of(cells, origins, table) if shrunk.any() else self, outcomes, cut, contradiction)
+        contradiction = Contradiction(*table.at(conflict, nan, nan)[:4])
+        return Clipped(self._of(cells, origins, table, sheets) if shrunk.any() else self, outcomes, cut, contradiction)
 
     def merge(self, most: int) -> Polytope:
         """Outer polytopes with at most `most` facets.
@@ -124,18 +145,18 @@ class Polytope:
         """
         cells, kept = zip(*(merged(cell, most) for cell in self._cells), strict=True)
         origins = [origin[some] for origin, some in zip(self._origins(), kept, strict=True)]
-        return self._of(list(cells), origins, _Rows.join(self._rows()))
+        return self._of(list(cells), origins, _Rows.join(self._rows()), self.sheets)
 
     def rows(self) -> tuple[Float[Tensor, "B F p"], Float[Tensor, "B F"]]:
         """A and b, with the gradients of the given rows that have become facets."""
-        return self.A, self.b
+        return self.sheets.attached(self.A, self.b, self.label)
 
     # Geometry -------------------------------------------------------------------------------------------------------
 
     @property
     def vertices(self) -> Float[Tensor, "B V p"]:
         """The vertices. Where more than p facets meet, p of them decide the gradient, with directions far apart."""
-        return sensitivity.vertices(self.A, self.b, self.corners, self.shape) if self._differentiable else self.corners
+        return sensitivity.vertices(*self.rows(), self.shape) if self._differentiable else self.corners
 
     def volume(self) -> Float[Tensor, "B"]:
         """The volume, or the length for p = 1. It is 0 for a flat set, whose width is lost in round-off."""
@@ -147,27 +168,35 @@ class Polytope:
 
     def diameter(self) -> Float[Tensor, "B"]:
         """The largest distance between two points of the set."""
-        apart = torch.cdist(self.corners, self.corners, compute_mode="donot_use_mm_for_euclid_dist").flatten(1)
-        furthest, at = apart.argmax(-1), torch.arange(len(apart), device=apart.device)
-        vertices, V = self.vertices, self.corners.shape[1]
-        return torch.linalg.vector_norm(vertices[at, furthest // V] - vertices[at, furthest % V], dim=-1)
+        ends, distance = (torch.from_numpy(part).to(self.A.device) for part in extent.farthest(array(self.corners)))
+        if not self._differentiable:
+            return distance
+        first, last = at(self.corners, ends).unbind(1)
+        along = torch.stack([first - last, last - first], dim=1)  # the directions in which the two are extreme
+        return derivatives.distance(distance, sensitivity.extreme(*self.rows(), self.shape, ends, along))
 
     def support(self, direction: Float[Tensor, "B D p"]) -> Float[Tensor, "B D"]:
         """The support function h(n) = max n.z over the set, n the `direction`."""
-        values = direction @ self.vertices.transpose(1, 2)
-        return values.gather(-1, values.detach().argmax(-1, keepdim=True)).squeeze(-1)
+        furthest = (direction.detach() @ self.corners.mT).argmax(-1)
+        if not self._differentiable:
+            return (direction * at(self.corners, furthest)).sum(-1)
+        return (direction * sensitivity.extreme(*self.rows(), self.shape, furthest, direction)).sum(-1)
 
     def chebyshev(self) -> tuple[Float[Tensor, "B p"], Float[Tensor, "B"]]:
         """Centre and radius of a largest inscribed ball: max r s.t. A_f.z + |A_f| r <= b_f.
 
         Where the centre is not unique, the one with the smallest z_1 is returned, among these the one with the smallest
         z_2, and so on. Its gradient is that of the p + 1 facets that decide this choice. The radius and its gradient
-        are right in any case. A flat set has the radius 0, and its centre is a point of the set.
+        are right in any case. A flat set has the radius 0, and its centre is a point of the set. Where no ball could be
+        verified as a largest one, it is the largest about a point of the set.
         """
-        ball = inscribed_ball(self._recentred)
-        flat = ball.radius <= FLAT * self.reach.amax(-1)
-        centre = self._middle + torch.where(flat.unsqueeze(-1), 0.0, ball.centre)
-        return centre, torch.where(flat, 0.0, ball.radius)
+        rows = self._recentred
+        centre, radius, status = inscribed_ball(rows)
+        flat, lost = radius <= FLAT * self.reach.amax(-1), status == ProgrammeStatus.UNSOLVED
+        if bool(lost.any()):
+            radius = torch.where(lost, rows.slack(torch.zeros_like(centre)).amin(-1).clamp(min=0.0), radius)
+        centre = self._middle + torch.where((flat | lost).unsqueeze(-1), 0.0, centre)
+        return centre, torch.where(flat, 0.0, radius)
 
     def nearest(
         self, point: Float[Tensor, "B p"], metric: Float[Tensor, "B p p"] | None = None
@@ -206,13 +235,13 @@ class Polytope:
     @property
     def _differentiable(self) -> bool:
         """Is a gradient required with respect to the rows?"""
-        return torch.is_grad_enabled() and (self.A.requires_grad or self.b.requires_grad)
+        return torch.is_grad_enabled() and bool(self.sheets.sheets)
 
     @property
     def _measure(self) -> tuple[Tensor, Tensor]:
         """Volume and centroid, with gradients if the rows require them."""
         if self._differentiable:
-            return sensitivity.measure(self.A, self.b, self.shape)
+            return sensitivity.measure(*self.rows(), self.shape)
         return self._as_tensor(self.shape.volume), self._as_tensor(self.shape.centroid)
 
     @property
@@ -223,12 +252,13 @@ class Polytope:
     @property
     def _recentred(self) -> Halfspaces:
         """The set with its middle moved to the origin. Its round-off is then proportional to its size."""
-        return Halfspaces(self.A, self.b - times(self.A, self._middle))
+        A, b = self.rows()
+        return Halfspaces(A, b - times(A, self._middle))
 
     @property
     def _round_off(self) -> Float[Tensor, "B F"]:
         """A bound on the rounding error of A z - b over the set."""
-        return (ROUND_OFF * (times(self.A.abs(), self.reach) + self.b.abs())).detach()
+        return ROUND_OFF * (times(self.A.abs(), self.reach) + self.b.abs())
 
     def _as_tensor(self, field: Reals) -> Tensor:
         return torch.as_tensor(field, device=self.A.device)
@@ -241,8 +271,8 @@ class Polytope:
     def _positions(self, items: Tensor) -> list[int]:
         return torch.arange(len(self.A), device=items.device)[items].tolist()
 
-    def _rows(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        return self.A, self.b, self.time, self.source
+    def _rows(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        return self.A, self.b, self.time, self.source, self.label
 
     def _origins(self, first: int = 0) -> list[Indices]:
         """The indices of each item's facets among all rows, if the rows of this batch begin at index `first`."""
@@ -250,11 +280,10 @@ class Polytope:
         return [first + i * F + np.arange(len(cell.b)) for i, cell in enumerate(self._cells)]
 
     @classmethod
-    def _of(cls, cells: list[Cell], origins: Sequence[Indices], rows: _Rows) -> Polytope:
-        """The batch of these cells, padded to the largest.
+    def _of(cls, cells: list[Cell], origins: Sequence[Indices], rows: _Rows, sheets: Sheets) -> Polytope:
+        """The batch of these cells, padded to the largest. The facets are taken from `rows`.
 
-        The facets and their gradients are taken from `rows`. The values of b are taken from the cells, where some rows
-        have been moved outward.
+        The values of b are taken from the cells, where some rows have been moved outward.
         """
         p, device = rows.A.shape[-1], rows.A.device
         counts = np.array([[len(cell.b), len(cell.vertices)] for cell in cells], dtype=np.int64).reshape(-1, 2)
@@ -265,28 +294,30 @@ class Polytope:
             origin[i, :f], right[i, :f] = origins[i], cell.b
             corners[i], corners[i, :v], incident[i, :v, :f] = cell.vertices[0], cell.vertices, cell.incident
             reach[i] = cell.reach
-        A, b, time, source = rows.at(torch.as_tensor(origin, device=device), 0.0, 1.0)
-        b = b + (torch.as_tensor(right, device=device) - b).detach()
+        A, _, time, source, label = rows.at(torch.as_tensor(origin, device=device), 0.0, 1.0)
+        sheets, label = sheets.in_use(label)
         table = (counts[:, 0], corners, incident, counts[:, 1], reach)
-        batch = cls(A, b, time, source, *(torch.as_tensor(field, device=device) for field in table))
+        b, *others = (torch.as_tensor(part, device=device) for part in (right, *table))
+        batch = cls(A, b, time, source, label, *others, sheets=sheets)
         batch.__dict__["_cells"] = cells
         return batch
 
 
 class _Rows(NamedTuple):
-    """Half-spaces in one flat list, with the time and source of each."""
+    """Half-spaces in one flat list, with the time, source and label of each."""
 
     A: Float[Tensor, "N p"]
     b: Float[Tensor, "N"]
     time: Float[Tensor, "N"]
     source: Int[Tensor, "N"]
+    label: Int[Tensor, "N"]
 
     @classmethod
-    def join(cls, *batches: tuple[Tensor, Tensor, Tensor, Tensor]) -> _Rows:
-        """The flat list of several batches, each A (B, R, p), b, time and source (B, R), item by item."""
+    def join(cls, *batches: tuple[Tensor, ...]) -> _Rows:
+        """The flat list of several batches, each A (B, R, p), b, time, source and label (B, R), item by item."""
         return cls(*(torch.cat([field.flatten(0, 1) for field in fields]) for fields in zip(*batches, strict=True)))
 
-    def at(self, index: Int[Tensor, "B K"], fill_A: float, fill_b: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def at(self, index: Int[Tensor, "B K"], fill_A: float, fill_b: float) -> tuple[Tensor, ...]:
         """The rows at the places `index`. Where it is -1, A and b are `fill_A` and `fill_b`, with the prior's stamp."""
         none = index < 0
         return (
@@ -294,4 +325,5 @@ class _Rows(NamedTuple):
             torch.where(none, fill_b, self.b[index]),
             torch.where(none, nan, self.time[index]),
             torch.where(none, PRIOR, self.source[index]),
+            torch.where(none, 0, self.label[index]),
         )

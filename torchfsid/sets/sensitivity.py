@@ -11,27 +11,52 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchfsid.halfspaces import Halfspaces
+from torchfsid.halfspaces import Halfspaces, array
 from torchfsid.programmes.differentiable import times
 from torchfsid.sets import derivatives
 from torchfsid.sets.derivatives import Skeleton, at
-from torchfsid.sets.faces import Indices
-from torchfsid.sets.shape import Shape
+from torchfsid.sets.faces import Indices, Mask, Reals, optimal_bases
+from torchfsid.sets.shape import Shape, lengths
 
 
-def vertices(
-    A: Float[Tensor, "B F p"], b: Float[Tensor, "B F"], corners: Float[Tensor, "B V p"], shape: Shape
-) -> Float[Tensor, "B V p"]:
-    """The corners as functions of the rows. A corner that is not the solution of p facets is constant."""
-    frame = _Frame.of(shape, A)
-    rows, right = frame.rows(A, b)
-    y, basis, solved = (torch.as_tensor(field, device=A.device) for field in (shape.y, *shape.bases))
-    moved = corners + frame.outside(_change(derivatives.solution(y, at(rows, basis), at(right, basis), solved)))
+def vertices(A: Float[Tensor, "B F p"], b: Float[Tensor, "B F"], shape: Shape) -> Float[Tensor, "B V p"]:
+    """The vertices as functions of the rows. A vertex that is not the solution of p facets is constant."""
+    moved = _solutions(A, b, shape, shape.vertices, shape.y, *shape.bases)
     real = torch.as_tensor(shape.incident.any(2), device=A.device)
     return torch.where(real.unsqueeze(-1), moved, moved[:, :1])
+
+
+def extreme(
+    A: Float[Tensor, "B F p"],
+    b: Float[Tensor, "B F"],
+    shape: Shape,
+    vertex: Int[Tensor, "B K"],
+    direction: Float[Tensor, "B K p"],
+) -> Float[Tensor, "B K p"]:
+    """The vertices of these numbers as functions of the rows. Each is extreme in its direction.
+
+    So its facets are those of an optimal basis: the derivatives of max d.z over the set are then right also where more
+    than p facets meet.
+    """
+    number, frame = array(vertex)[..., None], shape.frame
+    corners, y = (np.take_along_axis(points, number, axis=1) for points in (shape.vertices, shape.y))
+    incident = np.take_along_axis(shape.incident, number, axis=1)
+    given, scale = array(direction), frame.scale / frame.scale.max(1, keepdims=True)
+    inside = given / lengths(given)[..., None] @ frame.axes.swapaxes(1, 2) * scale[:, None]
+    return _solutions(A, b, shape, corners, y, *optimal_bases(shape.rows[0], incident, inside))
+
+
+def _solutions(
+    A: Tensor, b: Tensor, shape: Shape, corners: Reals, y: Reals, basis: Indices, solved: Mask
+) -> Float[Tensor, "B K p"]:
+    """The corners, with the coordinates y, as the solutions of the facets `basis`. Constant where not `solved`."""
+    frame = _Frame.of(shape, A)
+    rows, right = frame.rows(A, b)
+    number, place, index, known = (torch.as_tensor(field, device=A.device) for field in (corners, y, basis, solved))
+    return number + frame.outside(_change(derivatives.solution(place, at(rows, index), at(right, index), known)))
 
 
 def measure(
