@@ -177,7 +177,8 @@ class Polygon:
 
     def diameter(self) -> Float[Tensor, "B"]:
         """The largest distance between two points of the set."""
-        apart = (self.corners.unsqueeze(1) - self.corners.unsqueeze(2)).square().sum(-1).flatten(1)
+        # Not by matrix products, which would lose the distances of near vertices.
+        apart = torch.cdist(self.corners, self.corners, compute_mode="donot_use_mm_for_euclid_dist").flatten(1)
         ends = apart.argmax(-1, keepdim=True)
         vertices = self.vertices
         between = (at(vertices, ends // self.slots) - at(vertices, ends % self.slots)).squeeze(1)
