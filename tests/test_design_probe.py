@@ -16,6 +16,7 @@ from experiments.__main__ import main
 from experiments.design.config import ProbePlacementConfig
 from experiments.design.placement import place
 from experiments.design.probe import Objective, Probing, along, expectation
+from experiments.design.runs import follow
 from experiments.kinds import load as load_config
 from experiments.results import read_columns
 from experiments.studies.switches import across, summarise_switches
@@ -144,6 +145,59 @@ def test_at_a_switch_the_area_jumps():
     assert jumps[switched].max() > 1
     assert summarise_switches(rows)["switches"] == switches[-1] > 5
     assert y[-1] - y[0] == pytest.approx(0.2)
+
+
+# Runs ---------------------------------------------------------------------------------------------------------------
+
+AVOIDANCES = (
+    "avoidance={distance: squared, safety_distance: 0.4, class_k: {gain: 1.0}}",
+    "avoidance={distance: euclidean, safety_distance: 0.35, class_k: {gain: 20.0, power: 3}}",
+)
+PATHS = tensor(
+    [
+        [[0.62, 0.05], [0.9, -0.1], [0.8, 0.2]],
+        [[0.0, 0.5], [0.3, 0.42], [1.2, 0.0]],
+        [[0.0, 0.0], [0.7, 0.1], [0.8, 0.0]],
+    ]
+)
+"""Ahead of the robot, from its side to its front, and from its own place to its front."""
+
+
+@pytest.mark.parametrize("avoidance", AVOIDANCES)
+@pytest.mark.parametrize("placements", [None, PATHS])
+def test_compiled_runs_are_the_closed_loop(avoidance: str, placements: Tensor | None):
+    probing = Probing.of(load(avoidance))
+    goals = probing.draw_goals(8, seed=5)
+    runs, samples = probing.run(placements, goals), list(probing.loop(placements, goals))
+    x, u, bodies = (torch.stack([getattr(s.measurement, name) for s in samples]) for name in ("x", "u", "bodies"))
+    torch.testing.assert_close(runs.x, x, rtol=0, atol=1e-12)
+    torch.testing.assert_close(runs.u, u, rtol=0, atol=1e-12)
+    assert torch.equal(runs.bodies, bodies)
+    active, feasible = (torch.stack([getattr(s.control, name) for s in samples]) for name in ("active", "feasible"))
+    assert torch.equal(runs.feasible, feasible)
+    ours = torch.zeros_like(active, dtype=torch.long).scatter_add(-1, runs.rows, runs.filled.long())
+    assert torch.equal(ours.bool(), active)
+    assert placements is None or not feasible.all()
+
+
+@pytest.mark.parametrize("avoidance", AVOIDANCES)
+def test_gradients_of_runs_are_those_of_the_closed_loop(avoidance: str):
+    """Of a weighted sum of some positions and controls."""
+    probing = Probing.of(load(avoidance))
+    goals, rng = probing.draw_goals(8, seed=5), np.random.default_rng(0)
+    placements = PATHS.clone().requires_grad_()
+    T, B = probing.config.steps, len(PATHS) * len(goals)
+    weights, used = torch.from_numpy(rng.normal(size=(2, T, B, 2))), torch.from_numpy(rng.uniform(size=(T, B)) < 0.2)
+    weights = weights * used.unsqueeze(-1)
+    probe = probing.path(placements, T).repeat_interleave(len(goals), dim=1)
+    runs = probing.run(placements, goals)
+    found = follow(probing.controller, goals.repeat(len(PATHS), 1), runs, probe, used, probing.config.dt)
+    (ours,) = torch.autograd.grad((torch.stack(found) * weights).sum(), placements)
+    samples = [sample.measurement for sample in probing.loop(placements, goals)]
+    by_steps = torch.stack([torch.stack([getattr(s, name) for s in samples]) for name in ("x", "u")])
+    (theirs,) = torch.autograd.grad((by_steps * weights).sum(), placements)
+    torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
+    assert (theirs[:2].flatten(1).norm(dim=-1) > 0.1).all()
 
 
 # What counts --------------------------------------------------------------------------------------------------------

@@ -33,7 +33,7 @@ optimiser would exploit these failures.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import torch
@@ -41,6 +41,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from experiments.design.config import BoxConfig, ProbePlacementConfig
+from experiments.design.runs import Runs, follow, run
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.identification.evidence import ObservationModel, evidence
 from torchfsid.robots.bounds import NoiseBound
@@ -145,21 +146,32 @@ class Probing:
             goals: goals [m].
             steps: number of samples. Default: the whole run.
         """
-        config, S = self.config, len(goals)
-        P, K = (1, 0) if placements is None else placements.shape[:2]
-        standing = self.obstacles.expand(P * S, *self.obstacles.shape)
-        duration = config.dt * max(config.steps - 1, 1)
-        present = torch.ones(P * S, len(self.obstacles) + (K > 0), dtype=torch.bool)
+        bodies = self._bodies(placements, steps or self.config.steps).repeat_interleave(len(goals), dim=1)
+        (T, B), dt, present = bodies.shape[:2], self.config.dt, torch.ones(bodies.shape[1:3], dtype=torch.bool)
 
         def around(t: float, x: Tensor, _: Tensor) -> Measurement:
-            bodies = standing
-            if placements is not None:
-                probe = along(placements, min(t / duration, 1.0))
-                bodies = torch.cat([standing, probe.repeat_interleave(S, dim=0).unsqueeze(1)], dim=1)
-            return Measurement(t=t, x=x, u=None, bodies=bodies, present=present)
+            return Measurement(t=t, x=x, u=None, bodies=bodies[round(t / dt)], present=present)
 
-        theta, start = goals.repeat(P, 1), self.start.expand(P * S, 2)
-        return closed_loop(self.controller, theta, start, around, dt=config.dt, samples=steps or config.steps)
+        theta, start = goals.repeat(B // len(goals), 1), self.start.expand(B, 2)
+        return closed_loop(self.controller, theta, start, around, dt=dt, samples=T)
+
+    def run(
+        self, placements: Float[Tensor, "P K 2"] | None, goals: Float[Tensor, "S 2"], steps: int | None = None
+    ) -> Runs:
+        """The same closed loop in compiled code, all samples at once, without gradients."""
+        with torch.no_grad():
+            return run(self.config, self.start, goals, self._bodies(placements, steps or self.config.steps))
+
+    def _bodies(self, placements: Float[Tensor, "P K 2"] | None, samples: int) -> Float[Tensor, "T P M 2"]:
+        """The obstacles and the probe at each sample [m]."""
+        if placements is None:
+            return self.obstacles.expand(samples, 1, -1, -1)
+        path = self.path(placements, samples)
+        return torch.cat([self.obstacles.expand(*path.shape[:2], -1, -1), path.unsqueeze(2)], dim=2)
+
+    def path(self, placements: Float[Tensor, "P K 2"], samples: int) -> Float[Tensor, "T P 2"]:
+        """The positions of the probe at the first samples [m]."""
+        return along(placements, torch.arange(samples, dtype=torch.float64) / max(self.config.steps - 1, 1))
 
     def prior_of(self, items: int) -> FeasibleSet:
         """Theta_0, once for each item."""
@@ -179,35 +191,38 @@ class Probing:
             goals: goals [m].
             steps: number of samples. Default: the whole run.
         """
-        samples = list(self.loop(placements, goals, steps))
-        T, B, model = len(samples), len(samples[0].measurement.x), self.model
-        seen, prior = Measurement.concatenate([sample.measurement for sample in samples]), self.prior_of(B)
-        all_of_them = torch.ones(T, B, dtype=torch.bool)
+        runs, model, dt = self.run(placements, goals, steps), self.model, self.config.dt
+        T, B = runs.feasible.shape
+        seen, prior, theta = runs.measurement(dt), self.prior_of(B), goals.repeat(B // len(goals), 1)
         with torch.no_grad():
             found = evidence(model, prior, seen)
-            theta_set = prior.intersect(_by_item(found.omega, all_of_them))
-        sound = torch.stack([sample.control.feasible for sample in samples]).all(0) & ~theta_set.is_empty
-        sound = sound & ~found.alarmed.reshape(T, B).any(0)
+            A, b = (rows.unflatten(0, (T, B)).transpose(0, 1).flatten(1, 2) for rows in (found.omega.A, found.omega.b))
+            theta_set = prior.intersect(Halfspaces(A, b))
+        sound = runs.feasible.all(0) & ~theta_set.is_empty & ~found.alarmed.reshape(T, B).any(0)
         if placements is not None:
-            apart = (seen.x - seen.bodies[:, -1]).detach().norm(dim=-1).reshape(T, B)
+            apart = (runs.x - runs.bodies[:, :, -1]).norm(dim=-1)
             sound = sound & (apart >= self.config.safety_distance - TOUCHING).all(0)
-        sound = sound & theta_set.contains(goals.repeat(B // len(goals), 1), TOUCHING)
+        sound = sound & theta_set.contains(theta, TOUCHING)
         if torch.is_grad_enabled() and placements is not None and placements.requires_grad:
             sample = theta_set.facets().source // found.omega.rows  # negative: a facet of the prior
-            leaves_facet = torch.zeros(T + 1, B, dtype=torch.bool).scatter(0, sample.T % (T + 1), True)[:T]
-            again = seen.select(leaves_facet.flatten())
+            needed = torch.zeros(T + 1, B, dtype=torch.bool).scatter(0, sample.T % (T + 1), True)[:T] & sound
+            probe = self.path(placements, T).repeat_interleave(len(goals), dim=1)
+            x, u = follow(self.controller, theta, runs, probe, needed, dt)
+            again = seen.select(needed.flatten())
+            bodies = torch.cat([again.bodies[:, :-1], probe[needed].unsqueeze(1)], dim=1)
+            again = replace(again, x=x[needed], u=u[needed], bodies=bodies)
             told = evidence(model, self.prior_of(len(again.x)), again).omega
-            theta_set = prior.intersect(_by_item(told, leaves_facet))
+            theta_set = prior.intersect(_by_item(told, needed))
         area = torch.where(sound, theta_set.volume(), self.prior_area)
         return Left(area.reshape(-1, len(goals)), sound.reshape(-1, len(goals)))
 
 
-def along(placements: Float[Tensor, "P K 2"], fraction: float) -> Float[Tensor, "P 2"]:
+def along(placements: Float[Tensor, "P K 2"], fraction: float | Float[Tensor, "T"]) -> Float[Tensor, "*T P 2"]:
     """The position of the probe after this fraction of the run [m]."""
     K = placements.shape[1]
-    i = min(int(fraction * (K - 1)), max(K - 2, 0))
-    share = fraction * (K - 1) - i
-    return placements[:, i] if K == 1 else (1 - share) * placements[:, i] + share * placements[:, i + 1]
+    way = (K - 1) * torch.as_tensor(fraction, dtype=torch.float64).unsqueeze(-1)
+    weights = (1 - (way - torch.arange(K)).abs()).clamp(min=0)  # of the two way-points before and after it
+    return (weights[..., None, :, None] * placements).sum(-2)
 
 
 def expectation(area: Float[Tensor, "P S"], objective: Objective) -> Float[Tensor, "P"]:

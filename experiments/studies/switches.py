@@ -15,7 +15,6 @@ from torch import Tensor
 
 from experiments.design.probe import Probing, slope
 from torchfsid.identification.evidence import evidence
-from torchfsid.robots.measurement import Measurement
 
 REACH = 0.1
 """The probe is moved so far, to either side [m]."""
@@ -38,7 +37,7 @@ def across(probing: Probing, place: Float[Tensor, "2"], goal: Float[Tensor, "2"]
     slopes, y = slope(log_area.sum(), places)[:, 0, 1], places.detach()[:, 0, 1]
     log_area = log_area.detach()
     with torch.no_grad():
-        seen = Measurement.concatenate([sample.measurement for sample in probing.loop(places, goals)])
+        seen = probing.run(places, goals).measurement(probing.config.dt)
         active = evidence(probing.model, probing.prior_of(len(places)), seen).kkt.active
         history = active.unflatten(0, (-1, len(places))).transpose(0, 1)
     switched = (history[1:] != history[:-1]).flatten(1).any(-1).long()

@@ -52,20 +52,27 @@ def _beyond(vertices, k, n, p, q, c):
 @item
 @no_type_check
 def mark_cuts(vertices, k, n, reach, A, b, tolerance, depth, cutting):
-    """Mark the rows that some vertex of polygon k exceeds by more than round-off.
+    """Fill `cutting` with the rows that some vertex of polygon k exceeds by more than round-off, the deepest first.
 
     The bounding box rules out many rows without a loop. The arrays of the batch are indexed, since views cost more.
+
+    Returns the number of these rows.
     """
     x0, x1, y0, y1 = _box(vertices, k, n)
-    found = False
+    found = 0
     for r in range(b.shape[1]):
         p, q, c = A[k, r, 0], A[k, r, 1], b[k, r]
-        cutting[r] = False
         if p * (x1 if p > 0 else x0) + q * (y1 if q > 0 else y0) - c > 0:
             tolerance[r] = ROUND_OFF * (abs(p) * reach[k, 0] + abs(q) * reach[k, 1] + abs(c))
             beyond = _beyond(vertices, k, n, p, q, c)
-            cutting[r], depth[r] = beyond > tolerance[r], beyond / math.sqrt(p * p + q * q)
-            found = found or cutting[r]
+            if beyond > tolerance[r]:
+                depth[r] = beyond / math.sqrt(p * p + q * q)
+                s = found
+                while s > 0 and depth[cutting[s - 1]] < depth[r]:
+                    cutting[s] = cutting[s - 1]
+                    s -= 1
+                cutting[s] = r
+                found += 1
     return found
 
 
@@ -83,34 +90,30 @@ def _excess(ring, n, p, q, c, over):
 
 @item
 @no_type_check
-def cut_ring(ring, edge, n, lines, first_row, reach, tolerance, depth, cutting, over, spare, spare_edge):
-    """Cut the ring of n vertices by the rows marked `cutting`, the deepest first.
+def cut_ring(ring, edge, n, lines, first_row, reach, tolerance, cutting, cuts, over, spare, spare_edge):
+    """Cut the ring of n vertices by the first `cuts` rows of `cutting`, in this order.
 
     `edge` holds indices of lines (p, q, c). Row r is line first_row + r. A row is moved outward by changing its line.
 
     Returns (n, outcome, whether the ring is smaller, and three lines that contradict each other if it is EMPTY).
     """
     outcome, shrunk = NONEMPTY, False
-    while True:
-        row = -1
-        for r in range(len(cutting)):
-            if cutting[r] and (row < 0 or depth[r] > depth[row]):
-                row = r
-        if row < 0:
-            return n, outcome, shrunk, -1, -1, -1
-        cutting[row] = False
+    for s in range(cuts):
+        row = cutting[s]
         line, slack, inner = first_row + row, tolerance[row], 0
         most = _excess(ring, n, lines[line, 0], lines[line, 1], lines[line, 2], over)
         if most <= slack:  # an earlier cut has made it redundant
             continue
+        least = over[0]
         for i in range(1, n):
-            inner = i if over[i] < over[inner] else inner
-        if over[inner] >= -slack:
+            if over[i] < least:
+                least, inner = over[i], i
+        if least >= -slack:
             before, after = edge[before_in(inner, n)], edge[inner]
-            if over[inner] > slack and _contradict(lines, line, before, after, reach):
+            if least > slack and _contradict(lines, line, before, after, reach):
                 return n, EMPTY, False, line, before, after
             outcome = UNDECIDED
-        outward = over[inner] + 2 * slack
+        outward = least + 2 * slack
         if outward > 0:
             lines[line, 2] += outward
             for i in range(n):
@@ -120,6 +123,7 @@ def cut_ring(ring, edge, n, lines, first_row, reach, tolerance, depth, cutting, 
             slack = 0.0
         n = _keep_arc(ring, edge, n, line, inner, slack, over, spare, spare_edge)
         shrunk = True
+    return n, outcome, shrunk, -1, -1, -1
 
 
 @item
@@ -132,11 +136,9 @@ def _keep_arc(ring, edge, n, line, inner, slack, over, spare, spare_edge):
     while over[after_in(last, n)] <= slack:
         last = after_in(last, n)
     new, j = 0, first
-    while True:
+    for _ in range((last - first if last >= first else last - first + n) + 1):
         spare[new, 0], spare[new, 1], spare_edge[new] = ring[j, 0], ring[j, 1], edge[j]
         new += 1
-        if j == last:
-            break
         j = after_in(j, n)
     if over[last] < -slack:
         _cross(spare, new, ring, over, last, after_in(last, n))
@@ -266,7 +268,7 @@ def clip(polygons, A, b, stamp, source, first_label, most):
     vertices, ring_A, ring_b, time, ring_source, label, count, reach = polygons
     (B, R), V = b.shape, ring_b.shape[1]
     W = V + R + 1
-    tolerance, depth, cutting, over = np.empty(R), np.empty(R), np.empty(R, np.bool_), np.empty(W)
+    tolerance, depth, cutting, over = np.empty(R), np.empty(R), np.empty(R, np.int64), np.empty(W)
     ring, spare, lines = np.empty((W, 2)), np.empty((W, 2)), np.empty((W, 3))
     edge, spare_edge = np.empty(W, np.int64), np.empty(W, np.int64)
     result, slots, new = polygons, 0, 0
@@ -277,17 +279,17 @@ def clip(polygons, A, b, stamp, source, first_label, most):
     lost_time, lost_source = np.full((B, 3), np.nan), np.full((B, 3), -1)
     for k in range(B):
         n = count[k]
-        if not mark_cuts(vertices, k, n, reach, A, b, tolerance, depth, cutting):
-            continue
-        for i in range(n):
-            ring[i, 0], ring[i, 1], edge[i] = vertices[k, i, 0], vertices[k, i, 1], i
-            lines[i, 0], lines[i, 1], lines[i, 2] = ring_A[k, i, 0], ring_A[k, i, 1], ring_b[k, i]
-        for r in range(R):
-            if cutting[r]:
+        cuts = mark_cuts(vertices, k, n, reach, A, b, tolerance, depth, cutting)
+        if cuts > 0:
+            for i in range(n):
+                ring[i, 0], ring[i, 1], edge[i] = vertices[k, i, 0], vertices[k, i, 1], i
+                lines[i, 0], lines[i, 1], lines[i, 2] = ring_A[k, i, 0], ring_A[k, i, 1], ring_b[k, i]
+            for s in range(cuts):
+                r = cutting[s]
                 lines[V + r, 0], lines[V + r, 1], lines[V + r, 2] = A[k, r, 0], A[k, r, 1], b[k, r]
-        n, outcome[k], shrunk[k], row, before, after = cut_ring(
-            ring, edge, n, lines, V, reach[k], tolerance, depth, cutting, over, spare, spare_edge
-        )
+            n, outcome[k], shrunk[k], row, before, after = cut_ring(
+                ring, edge, n, lines, V, reach[k], tolerance, cutting, cuts, over, spare, spare_edge
+            )
         if outcome[k] == EMPTY:
             for i, e in enumerate((row, before, after)):
                 lost_A[k, i, 0], lost_A[k, i, 1] = lines[e, 0], lines[e, 1]
@@ -299,20 +301,16 @@ def clip(polygons, A, b, stamp, source, first_label, most):
             # Each area carries the round-off of its sum.
             shrunk[k] = area_of(ring, n) <= area_of(vertices[k], count[k]) * (1 - ROUND_OFF)
         if not shrunk[k]:
+            if slots > 0:
+                _copy(polygons, k, result)
             continue
-        if n > slots:  # seldom: slots grow by eight, and all polygons are copied
+        if n > slots:  # seldom: slots grow by eight, and the polygons before this one are copied
             slots = max((n + 7) // 8 * 8, V)
-            result = _widened(result, slots)
+            result = _widened(result, k, slots)
             to_vertices, to_A, to_b, to_time, to_source, to_label, to_count, _ = result
         to_count[k] = n
-        for i in range(slots):
-            j = i if i < n else 0
-            to_vertices[k, i, 0], to_vertices[k, i, 1] = ring[j, 0], ring[j, 1]
-        for i in range(max(n, count[k])):
-            if i >= n:
-                to_A[k, i, 0], to_A[k, i, 1], to_b[k, i] = 0.0, 0.0, 1.0
-                to_time[k, i], to_source[k, i], to_label[k, i] = np.nan, -1, 0
-                continue
+        for i in range(n):
+            to_vertices[k, i, 0], to_vertices[k, i, 1] = ring[i, 0], ring[i, 1]
             e = edge[i]
             to_A[k, i, 0], to_A[k, i, 1], to_b[k, i] = lines[e, 0], lines[e, 1], lines[e, 2]
             if e < V:
@@ -323,25 +321,45 @@ def clip(polygons, A, b, stamp, source, first_label, most):
                 if first_label > 0:
                     to_label[k, i], entered[new] = first_label + new, k * R + e - V
                     new += 1
+        _pad(result, k, n)
     return result, outcome, shrunk, entered[:new], (lost_A, lost_b, lost_time, lost_source)
 
 
 @launcher
 @no_type_check
-def _widened(polygons, slots):
-    """A copy with `slots` slots for vertices. New slots repeat the first vertex and hold padding rows."""
-    vertices, A, b, time, source, label, count, reach = polygons
-    (B, V), wide_count = b.shape, count.copy()
-    wide_vertices, wide_A, wide_b = np.empty((B, slots, 2)), np.empty((B, slots, 2)), np.empty((B, slots))
-    wide_time, wide_source = np.empty((B, slots)), np.empty((B, slots), np.int64)
-    wide_label = np.empty((B, slots), np.int64)
-    for k in range(B):
-        for i in range(V):
-            wide_vertices[k, i, 0], wide_vertices[k, i, 1] = vertices[k, i, 0], vertices[k, i, 1]
-            wide_A[k, i, 0], wide_A[k, i, 1], wide_b[k, i] = A[k, i, 0], A[k, i, 1], b[k, i]
-            wide_time[k, i], wide_source[k, i], wide_label[k, i] = time[k, i], source[k, i], label[k, i]
-        for i in range(V, slots):
-            wide_vertices[k, i, 0], wide_vertices[k, i, 1] = vertices[k, 0, 0], vertices[k, 0, 1]
-            wide_A[k, i, 0], wide_A[k, i, 1], wide_b[k, i] = 0.0, 0.0, 1.0
-            wide_time[k, i], wide_source[k, i], wide_label[k, i] = np.nan, -1, 0
-    return wide_vertices, wide_A, wide_b, wide_time, wide_source, wide_label, wide_count, reach
+def _widened(polygons, done, slots):
+    """New arrays with `slots` slots for vertices, and the first `done` polygons in them."""
+    _, _, b, _, _, _, count, reach = polygons
+    B = len(b)
+    wide = (
+        np.empty((B, slots, 2)), np.empty((B, slots, 2)), np.empty((B, slots)), np.empty((B, slots)),
+        np.empty((B, slots), np.int64), np.empty((B, slots), np.int64), count.copy(), reach,
+    )  # fmt: skip
+    for k in range(done):
+        _copy(polygons, k, wide)
+    return wide
+
+
+@item
+@no_type_check
+def _copy(polygons, k, wide):
+    """Copy polygon k to arrays with as many slots or more."""
+    vertices, A, b, time, source, label, count, _ = polygons
+    to_vertices, to_A, to_b, to_time, to_source, to_label, to_count, _ = wide
+    for i in range(count[k]):
+        to_vertices[k, i, 0], to_vertices[k, i, 1] = vertices[k, i, 0], vertices[k, i, 1]
+        to_A[k, i, 0], to_A[k, i, 1], to_b[k, i] = A[k, i, 0], A[k, i, 1], b[k, i]
+        to_time[k, i], to_source[k, i], to_label[k, i] = time[k, i], source[k, i], label[k, i]
+    to_count[k] = count[k]
+    _pad(wide, k, count[k])
+
+
+@item
+@no_type_check
+def _pad(polygons, k, n):
+    """Fill the slots of polygon k behind its n vertices: they repeat the first vertex and hold padding rows."""
+    vertices, A, b, time, source, label, _, _ = polygons
+    for i in range(n, b.shape[1]):
+        vertices[k, i, 0], vertices[k, i, 1] = vertices[k, 0, 0], vertices[k, 0, 1]
+        A[k, i, 0], A[k, i, 1], b[k, i] = 0.0, 0.0, 1.0
+        time[k, i], source[k, i], label[k, i] = np.nan, -1, 0
