@@ -66,13 +66,13 @@ class Sight(NamedTuple):
 
 @dataclass(frozen=True)
 class ClassK:
-    """alpha(h) = gain sign(h) |h|^power, an extended class-K function."""
+    """alpha(h) = gain sign(h) |h|^power, an extended class-K function. A gain (B, 1) is one for each robot."""
 
     gain: float | Tensor
     power: float = 1.0
 
     def __post_init__(self) -> None:
-        if not (bool(torch.as_tensor(self.gain) > 0) and self.power > 0):
+        if not (bool((torch.as_tensor(self.gain) > 0).all()) and self.power > 0):
             raise InputError("class_k", "gain > 0 and power > 0", (self.gain, self.power))
 
     def __call__(self, h: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
