@@ -22,7 +22,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchfsid.observers.safety import Refutation, SafetyObserver
+from torchfsid.observers.safety import SafetyObserver
+from torchfsid.observers.safety_sets import Refutation
 from torchfsid.robots.measurement import Measurement
 from torchfsid.sets.feasible_set import FeasibleSet
 
@@ -62,13 +63,15 @@ class SafetyColumns:
     """The columns of estimates.csv, sample by sample. They are computed only for sets Psi that have changed."""
 
     def __init__(self, observer: SafetyObserver):
-        self._unknown, self._last, self._texts = observer.model.unknown, None, []
+        self._unknown, self._robots = observer.model.unknown, observer.robots
+        self._last, self._texts = None, []
 
     def __call__(self, psi: FeasibleSet) -> list[list[str]]:
         if psi is not self._last:
             found = self._unknown.intervals(psi)
             rows = torch.cat([found.gain, found.distance], dim=-1).tolist()
-            self._last, self._texts = psi, [[f"{value:.15g}" for value in row] for row in rows]
+            texts = [[f"{value:.15g}" for value in row] for row in rows]
+            self._last, self._texts = psi, texts if len(texts) == self._robots else texts * self._robots
         return self._texts
 
 

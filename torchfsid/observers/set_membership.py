@@ -61,7 +61,7 @@ class SetEstimate:
         evidence: the evidence of this measurement alone.
         informative: whether the sample was used.
         status: a `Status` per robot, the worst so far.
-        safety: Psi of every robot, where the safety parameters are unknown (`SafetyObserver`).
+        safety: Psi of the team, batch (1,), or of every robot, where safety parameters are unknown (`SafetyObserver`).
     """
 
     t: float
