@@ -73,6 +73,12 @@ class Cuts:
     item: Int[Tensor, "k"]
     active: Bool[Tensor, "k"]
 
+    @classmethod
+    def none(cls) -> Cuts:
+        """No half-planes."""
+        none = torch.zeros(0, dtype=torch.long)
+        return cls(Halfspaces(torch.zeros(0, 2), torch.zeros(0), none), none, none.bool())
+
     def select(self, which: Bool[Tensor, "k"]) -> Cuts:
         """Some of the half-planes."""
         source = None if self.rows.source is None else self.rows.source[which]
@@ -107,14 +113,14 @@ class Reading:
         cuts: the half-planes of psi, those only that cut it.
         evidence: the evidence about theta.
         undecided: for each item and row of the unknown barrier, whether Psi leaves open that the row is active.
-        high: the half-planes w_j <= high_j, item by item.
+        rows: what the rows of the unknown barrier say about psi.
     """
 
     theta: FeasibleSet
     cuts: Cuts
     evidence: Evidence
     undecided: Bool[Tensor, "items m"]
-    high: Halfspaces
+    rows: SafetyRows
 
 
 @dataclass(frozen=True)
@@ -178,11 +184,12 @@ class LearningModel:
         first = sum(model.barriers[i](measurement).rows for i in range(place))
         rows = within.safety_rows(measurement, *self._bounds(measurement))
         undecided = rows.undecided & found.informative.unsqueeze(-1)
-        undecided = undecided & ~theta.is_empty.repeat(len(measurement.x) // max(robots, 1)).unsqueeze(-1)
+        if theta.any_empty:
+            undecided = undecided & ~theta.is_empty.repeat(len(measurement.x) // max(robots, 1)).unsqueeze(-1)
         tests = undecided if tested is None else undecided & tested.unsqueeze(-1)
         must = _must_be_active(tests, found, theta, first)
-        cuts = self._cuts(rows, corners, found, must, first)
-        return Reading(theta, cuts, found, undecided & ~must, rows.active)
+        kept = rows.cuts & found.informative.unsqueeze(-1) & (not self.unknown.soft)
+        return Reading(theta, _cuts(rows, kept, must, found.slack.shape[-1], first), found, undecided & ~must, rows)
 
     def _bounds(self, measurement: Measurement) -> tuple[ErrorBounds, Tensor]:
         errors = ErrorBounds.of(measurement, self.noise) or ErrorBounds.none(measurement)
@@ -191,19 +198,23 @@ class LearningModel:
             slack = slack + measurement.velocity_error.unsqueeze(-1)
         return errors, slack
 
-    def _cuts(self, rows: SafetyRows, corners: Tensor, found: Evidence, must: Tensor, first: int) -> Cuts:
-        kept = torch.zeros_like(must)
-        if not self.unknown.soft:
-            with torch.no_grad():
-                outside = rows.kept.A @ corners.mT > rows.kept.b.unsqueeze(-1)
-                kept = outside.any(-1) & found.informative.unsqueeze(-1)
-        (item, row), (active_item, active_row) = kept.nonzero().unbind(-1), must.nonzero().unbind(-1)
-        items, m = torch.cat([item, active_item]), found.slack.shape[-1]
-        A = torch.cat([rows.kept.A[item, row], rows.active.A[active_item, active_row]])
-        b = torch.cat([rows.kept.b[item, row], rows.active.b[active_item, active_row]])
-        source = items * m + first + torch.cat([row, active_row])
-        active = torch.arange(len(items), device=items.device) >= len(item)
-        return Cuts(Halfspaces(A, b, source), items, active)
+
+def active_halfplanes(rows: SafetyRows, items: Int[Tensor, "k"], row: Int[Tensor, "k"]) -> Halfspaces:
+    """The half-planes w_j <= high_j of some rows of some items, k rows."""
+    q = rows.active_q[items, row]
+    return Halfspaces(torch.stack([q, -torch.ones_like(q)], dim=-1), rows.high[items, row])
+
+
+def _cuts(rows: SafetyRows, kept: Bool[Tensor, "items m"], must: Bool[Tensor, "items m"], m: int, first: int) -> Cuts:
+    """The half-planes of the rows that are kept, and of those that must be active, of a model with m rows."""
+    if not (bool(kept.any()) or bool(must.any())):
+        return Cuts.none()
+    (item, row), (active_item, active_row) = kept.nonzero().unbind(-1), must.nonzero().unbind(-1)
+    q, active = rows.kept_q[item, row], active_halfplanes(rows, active_item, active_row)
+    A = torch.cat([torch.stack([-q, torch.ones_like(q)], dim=-1), active.A])
+    b, items = torch.cat([-rows.low[item, row], active.b]), torch.cat([item, active_item])
+    source = items * m + first + torch.cat([row, active_row])
+    return Cuts(Halfspaces(A, b, source), items, torch.arange(len(items), device=items.device) >= len(item))
 
 
 def _by_robot(omega: Halfspaces, t: float | Tensor, robots: int) -> tuple[Halfspaces, float | Tensor]:
@@ -224,10 +235,10 @@ def _must_be_active(
     tests: Bool[Tensor, "items m"], found: Evidence, theta: FeasibleSet, first: int
 ) -> Bool[Tensor, "items m"]:
     """Rule 4: the rows without which no theta explains the motion."""
-    items, rows = tests.nonzero().unbind(-1)
     must = torch.zeros_like(tests)
-    if len(items) == 0:
+    if not bool(tests.any()):
         return must
+    items, rows = tests.nonzero().unbind(-1)
     with torch.no_grad():
         robot = items % theta.batch_shape[0]
         omega = found.omega_without(items, rows + first)

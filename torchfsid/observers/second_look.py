@@ -21,7 +21,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.identification.safety_parameters import LearningModel, Possible
+from torchfsid.identification.safety_parameters import LearningModel, Possible, active_halfplanes
+from torchfsid.robots.avoidance_within import SafetyRows
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.unknown_avoidance import UnknownAvoidance, extremes
 from torchfsid.sets.feasible_set import FeasibleSet
@@ -58,21 +59,21 @@ class Samples:
         measurement: the samples concatenated, items = samples x robots.
         settled: rows that a split has decided.
         undecided: rows that Psi leaves undecided, and no split has settled.
-        high: the half-planes w_j <= high_j.
+        rows: what the rows say about psi. None before they are read.
     """
 
     measurement: Measurement
     settled: Bool[Tensor, "items m"]
     undecided: Bool[Tensor, "items m"]
-    high: Halfspaces
+    rows: SafetyRows | None
 
     def open(self, robots: int) -> Samples:
         """The samples in which a row of some robot is undecided."""
         items = self.undecided.any(-1).unflatten(0, (-1, robots)).any(-1).repeat_interleave(robots)
-        if bool(items.all()):
+        if bool(items.all()) or self.rows is None:
             return self
-        high = Halfspaces(self.high.A[items], self.high.b[items])
-        return Samples(self.measurement.select(items), self.settled[items], self.undecided[items], high)
+        rows = SafetyRows(*(part[items] for part in self.rows))
+        return Samples(self.measurement.select(items), self.settled[items], self.undecided[items], rows)
 
 
 @dataclass(frozen=True)
@@ -88,9 +89,10 @@ class Cell:
         best: tuple[float, int, int, int] = (LEAST_PART, -1, -1, -1)
         for k, samples in enumerate(self.samples):
             items, rows = samples.undecided.nonzero().unbind(-1)
-            if len(items) == 0:
+            if len(items) == 0 or samples.rows is None:
                 continue
-            w = samples.high.A[items, rows] @ corners.T - samples.high.b[items, rows].unsqueeze(-1)
+            line = active_halfplanes(samples.rows, items, rows)
+            w = line.A @ corners.T - line.b.unsqueeze(-1)
             low, high = extremes(w).unbind(-1)
             balance = torch.minimum(-low, high) / (high - low)
             place = int(balance.argmax())
@@ -99,10 +101,13 @@ class Cell:
         _, k, item, row = best
         if k < 0:
             return None
+        rows = self.samples[k].rows
+        assert rows is not None
         settled = self.samples[k].settled.clone()
         settled[item, row] = True
         samples = (*self.samples[:k], replace(self.samples[k], settled=settled), *self.samples[k + 1 :])
-        a, b = self.samples[k].high.A[item, row], self.samples[k].high.b[item, row]
+        line = active_halfplanes(rows, torch.tensor([item]), torch.tensor([row]))
+        a, b = line.A[0], line.b[0]
         w = corners @ a
         beside = b + BESIDE * (w.max() - w.min())
         possible = self.possible
@@ -133,9 +138,7 @@ def second_look(
     for k in range(0, len(measurements), size):
         together = Measurement.concatenate(measurements[k : k + size])
         unread = torch.zeros(len(together.x), together.bodies.shape[-2], dtype=torch.bool)
-        samples.append(
-            Samples(together, unread, unread, Halfspaces(torch.zeros(*unread.shape, 2), torch.ones(unread.shape)))
-        )
+        samples.append(Samples(together, unread, unread, None))
     first = _contracted(model, replace(first, samples=tuple(samples)))
     if bool(first.possible.is_empty.any()):
         return first.possible
@@ -168,7 +171,7 @@ def _contracted(model: LearningModel, cell: Cell) -> Cell:
             if bool(possible.is_empty.any()):
                 return Cell(possible, ())
             undecided = read.undecided & ~part.settled
-            found.append(Samples(part.measurement, part.settled, undecided, read.high).open(robots))
+            found.append(Samples(part.measurement, part.settled, undecided, read.rows).open(robots))
         samples = _joined([part for part in found if len(part.measurement.x) > 0])
         if not samples or float(possible.psi.volume()) > SHRUNK * before:
             break
@@ -188,7 +191,7 @@ def _joined(parts: Sequence[Samples]) -> tuple[Samples, ...]:
             Measurement.concatenate([part.measurement for part in some]),
             torch.cat([part.settled for part in some]),
             torch.cat([part.undecided for part in some]),
-            Halfspaces(torch.cat([part.high.A for part in some]), torch.cat([part.high.b for part in some])),
+            SafetyRows(*(torch.cat(parts) for parts in zip(*(part.rows for part in some if part.rows), strict=True))),
         )
         if len(some) > 1
         else some[0]

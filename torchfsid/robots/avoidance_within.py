@@ -37,16 +37,22 @@ NEAREST = 1e-9
 
 
 class SafetyRows(NamedTuple):
-    """Half-planes of psi from the rows of a measurement.
+    """What the rows of a measurement say about psi.
 
     Attributes:
-        kept: w >= low, true of every row that the controller keeps.
-        active: w <= high, true of every active row.
+        kept_q: q of the half-planes w >= low, true of every row that the controller keeps.
+        low: their right-hand sides.
+        active_q: q of the half-planes w <= high, true of every active row.
+        high: their right-hand sides.
+        cuts: whether w >= low cuts Psi.
         undecided: whether Psi leaves it open that the row is active.
     """
 
-    kept: Halfspaces
-    active: Halfspaces
+    kept_q: Float[Tensor, "*batch m"]
+    low: Float[Tensor, "*batch m"]
+    active_q: Float[Tensor, "*batch m"]
+    high: Float[Tensor, "*batch m"]
+    cuts: Bool[Tensor, "*batch m"]
     undecided: Bool[Tensor, "*batch m"]
 
 
@@ -126,7 +132,7 @@ class AvoidanceWithin:
         return phi - speed - ROUND_OFF * (phi.abs() + speed)
 
     def safety_rows(self, measurement: Measurement, bounds: ErrorBounds, slack: Float[Tensor, "*#B #m"]) -> SafetyRows:
-        """What the rows say about psi. Those of bodies that are not present or not clearly seen are padding.
+        """What the rows say about psi. Those of bodies that are not present or not clearly seen say nothing.
 
         They are differentiable with respect to the measurement, except where closing + or - slack is zero and the power
         is above 1.
@@ -145,15 +151,11 @@ class AvoidanceWithin:
         slack = slack + sight.loose + round_off
         low = spow((closing - slack) * unknown.size(farthest.r), 1 / unknown.power)
         high = spow((closing + slack) * unknown.size(nearest.r), 1 / unknown.power)
-        q = nearest.least
-        known = measurement.present & sight.clear & (low.isfinite() & high.isfinite() & q.isfinite())
+        known = measurement.present & sight.clear & low.isfinite() & high.isfinite() & nearest.least.isfinite()
         least, largest = nearest.reach
-        one = torch.ones_like(q)
-        return SafetyRows(
-            Halfspaces(torch.stack([-farthest.largest, one], dim=-1), -low).where(known),
-            Halfspaces(torch.stack([q, -one], dim=-1), high).where(known),
-            known & (least <= high) & (largest > high),
-        )
+        smallest = least if farthest.largest is nearest.least else self._reach(farthest.largest.detach())[0]
+        cuts, undecided = known & (smallest < low), known & (least <= high) & (largest > high)
+        return SafetyRows(farthest.largest, low, nearest.least, high, cuts, undecided)
 
     def _look(self, measurement: Measurement) -> _Look:
         """The rows' geometry. It is kept, since rows, errors and half-planes of one measurement ask for it in turn."""
@@ -193,6 +195,9 @@ class AvoidanceWithin:
         if measurement.radius is None or others is None:
             raise InputError("measurement.radius", "radii, since the barrier is given by a margin", None)
         radii = measurement.radius.unsqueeze(-1) + others
+        if unknown.distance == "euclidean" or bool((radii == unknown.reference).all()):
+            q = unknown.q(r, radii, 0.0)
+            return q, q
         first, last = (unknown.q(r, radii, margin) for margin in self._margins)
         return torch.minimum(first, last), torch.maximum(first, last)
 
