@@ -77,7 +77,7 @@ def test_each_robot_is_identified_by_refuting_the_others(
     out = tmp_path / "out"
     assert main(["observe", str(log), "--config", str(config), "--out", str(out)]) == 0
     text = capsys.readouterr().out
-    assert "which task is it?" in text
+    assert "which model is it?" in text
     assert all(f"│ {body} " in text for body in BODIES)
     verdicts = json.loads((out / "hypotheses.json").read_text())
     assert list(verdicts) == BODIES
