@@ -30,7 +30,7 @@ def cut(polytope: Polytope, A: np.ndarray, b: np.ndarray, time: float = 0.0) -> 
     """Clip by rows (R, p), the same for every item, or (B, R, p)."""
     B = len(polytope.count)
     rows, right = tensor(A).expand(B, *A.shape[-2:]), tensor(b).expand(B, b.shape[-1])
-    stamp = torch.full((B,), time, dtype=torch.float64)
+    stamp = torch.full_like(right, time)
     return polytope.clip(rows, right, stamp, torch.arange(b.shape[-1]).expand(right.shape), 1000)
 
 

@@ -47,7 +47,7 @@ def seed():
 
 def clipped_box(A: Tensor, b: Tensor) -> Polygon:
     half = torch.full((len(b), 2), 2.0, dtype=torch.float64)
-    time = torch.zeros(len(b), dtype=torch.float64)
+    time = torch.zeros(b.shape, dtype=torch.float64)
     return Polygon.from_box(-half, half).clip(A, b, time, torch.zeros(b.shape, dtype=torch.long), 1000).body
 
 
@@ -128,7 +128,7 @@ def test_a_cut_through_a_corner_has_the_derivative_of_its_facet(upper: list, row
     corner = torch.tensor([upper], dtype=torch.float64)
     polygon = Polygon.from_box(torch.zeros_like(corner), corner)
     A, nothing = torch.tensor([[row]], dtype=torch.float64), torch.zeros(1, 1, dtype=torch.long)
-    triangle = polygon.clip(A, b, torch.zeros(1, dtype=torch.float64), nothing, 8).body
+    triangle = polygon.clip(A, b, torch.zeros(1, 1, dtype=torch.float64), nothing, 8).body
     asked = triangle.volume(), triangle.centroid()[:, 0], triangle.support(torch.ones(1, 1, 2).double())
     found = [torch.autograd.grad(answer.sum(), b, retain_graph=True)[0].item() for answer in asked]
     assert found == pytest.approx(slopes, rel=1e-12)
@@ -140,7 +140,7 @@ def test_a_thin_set_far_away_sweeps_with_all_of_its_facets():
     b = torch.tensor([[101e6 + 1, -101e6, 101e6 + 1, -101e6]], dtype=torch.float64, requires_grad=True)
     corner = torch.full((1, 2), 1e6, dtype=torch.float64)
     polygon = Polygon.from_box(corner - 4e-9, corner + 1.0)
-    cut = polygon.clip(A, b, torch.zeros(1, dtype=torch.float64), torch.arange(4).expand(1, 4), 8).body
+    cut = polygon.clip(A, b, torch.zeros(1, 4, dtype=torch.float64), torch.arange(4).expand(1, 4), 8).body
     (slopes,) = torch.autograd.grad(cut.volume().sum(), b)
     ends = cut.corners[0, : int(cut.count)]
     for row, source in zip(cut.A[0], cut.source[0], strict=True):
@@ -161,7 +161,7 @@ def test_gradients_are_those_of_clips_in_torch():
         A = torch.from_numpy(np.stack([np.cos(angle), np.sin(angle)], axis=-1))
         b = (A * truth).sum(-1) + torch.from_numpy(distance)
         rows += [A.requires_grad_(), b.requires_grad_()]
-        polygon = polygon.clip(A, b, torch.zeros(count).double(), torch.zeros(count, 6).long(), 32).body
+        polygon = polygon.clip(A, b, torch.zeros(count, 6).double(), torch.zeros(count, 6).long(), 32).body
         rings, size = rings.clip(A, b), 0.2 * size
     torch.testing.assert_close(polygon.volume(), rings.area(), rtol=1e-9, atol=0)
     for mine, other in ((polygon.volume().log(), rings.area().log()), (polygon.centroid(), rings.centroid())):
@@ -182,13 +182,13 @@ def test_memory_is_facets():
         A = torch.from_numpy(np.stack([np.cos(angle), np.sin(angle)], axis=-1))
         right = b + 8 * 0.99**k
         graphs.append(weakref.ref(right))
-        polygon = polygon.clip(A, right, torch.zeros(3).double(), torch.zeros(3, 4).long(), 12).body
+        polygon = polygon.clip(A, right, torch.zeros(3, 4).double(), torch.zeros(3, 4).long(), 12).body
         assert polygon.sheets.rows <= 2 * polygon.label.numel()
     del right
     assert sum(graph() is not None for graph in graphs) <= 36
     assert len(polygon.sheets.sheets) <= 36
     assert torch.autograd.grad(polygon.volume().sum(), b)[0].abs().sum() > 0
-    fresh = polygon.clip(torch.zeros(3, 1, 2).double(), torch.ones(3, 1).double(), torch.zeros(3).double(),
+    fresh = polygon.clip(torch.zeros(3, 1, 2).double(), torch.ones(3, 1).double(), torch.zeros(3, 1).double(),
                          torch.zeros(3, 1).long(), 12).body  # fmt: skip
     assert fresh is polygon
 
@@ -270,7 +270,7 @@ def test_area_as_a_function_of_positions_and_control(kind: str):
             theta = inverse_optimal_set(safe_controls, u, C, d, NoiseBound(0.05))
         half = torch.full((1, 2), 6.0, dtype=torch.float64)
         source = torch.zeros(theta.b.shape, dtype=torch.long)
-        time = torch.zeros(1, dtype=torch.float64)
+        time = torch.zeros(theta.b.shape, dtype=torch.float64)
         return Polygon.from_box(-half, half).clip(theta.A, theta.b, time, source, 1000).body.volume()
 
     assert 1 < area(x, bodies, u) < 100

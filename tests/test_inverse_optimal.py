@@ -142,7 +142,7 @@ def test_without_noise_it_is_inside_the_critical_region():
 
 
 def clipped(theta: Halfspaces, around: Tensor, half: float) -> Polygon:
-    box, time = Polygon.from_box(around - half, around + half), theta.b.new_zeros(len(theta.b))
+    box, time = Polygon.from_box(around - half, around + half), torch.zeros_like(theta.b)
     return box.clip(theta.A, theta.b, time, torch.zeros_like(theta.b).long(), most=theta.rows + 4).body
 
 

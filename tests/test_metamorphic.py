@@ -49,7 +49,7 @@ def supports(theta: Halfspaces, around: Tensor) -> Tensor:
 
 
 def clipped(A: Tensor, b: Tensor, start: Polygon) -> Polygon:
-    return start.clip(A, b, b.new_zeros(len(b)), torch.zeros(b.shape, dtype=torch.long), 1000).body
+    return start.clip(A, b, torch.zeros_like(b), torch.zeros(b.shape, dtype=torch.long), 1000).body
 
 
 def box(count: int, half: float) -> Polygon:

@@ -239,7 +239,7 @@ def test_in_the_plane_it_agrees_with_polygons() -> None:
         polytope, polygon = Polytope.from_box(*corners), Polygon.from_box(*corners)
         for _ in range(4):
             A, b = rows_around(rng, truth, 5, 2.0)
-            stamp, source = torch.zeros(1, dtype=torch.float64), torch.arange(5)[None]
+            stamp, source = torch.zeros(1, 5, dtype=torch.float64), torch.arange(5)[None]
             flat = polygon.clip(tensor(A)[None], tensor(b)[None], stamp, source, 1000)
             after = cut(polytope, A, b)
             assert after.outcome == flat.outcome

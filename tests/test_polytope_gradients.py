@@ -37,7 +37,7 @@ def corners(p: int, half: float, count: int) -> tuple[Tensor, Tensor]:
 def clipped(A: Tensor, b: Tensor, body: Polytope | None = None, half: float = 2.0) -> Polytope:
     """A box (or body) cut by rows (B, R, p)."""
     body = Polytope.from_box(*corners(A.shape[-1], half, len(A))) if body is None else body
-    time, source = torch.zeros(len(A), dtype=torch.float64), torch.zeros(b.shape, dtype=torch.long)
+    time, source = torch.zeros(b.shape, dtype=torch.float64), torch.zeros(b.shape, dtype=torch.long)
     return body.clip(A, b, time, source, 1000).body
 
 
@@ -187,7 +187,7 @@ def test_in_the_plane_polygons_have_the_same_derivatives() -> None:
     A = torch.randn(3, 8, 2, generator=generator, dtype=torch.float64).requires_grad_()
     b = (A.detach().norm(dim=-1) * torch.linspace(0.6, 1.6, 8, dtype=torch.float64)).requires_grad_()
     points, factors = 3 * torch.ones(3, 2, dtype=torch.float64), torch.randn(3, 2, 2, generator=generator).double()
-    time, source = torch.zeros(3, dtype=torch.float64), torch.zeros(3, 8, dtype=torch.long)
+    time, source = torch.zeros(3, 8, dtype=torch.float64), torch.zeros(3, 8, dtype=torch.long)
     polygon = Polygon.from_box(*corners(2, 2.0, 3)).clip(A, b, time, source, 1000).body
     weights = torch.randn(3, 2, generator=generator).double()
     derivatives = []

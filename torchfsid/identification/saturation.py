@@ -89,7 +89,7 @@ def _unclipped(
     tangents = Halfspaces(around, reach.expand(-1, DIRECTIONS))
     inside = Halfspaces.stack([admissible, tangents])
     no_source = torch.zeros_like(inside.b, dtype=torch.long)
-    clipped = corner.clip(inside.A, inside.b, like.new_zeros(batch), no_source, most=inside.rows + 4)
+    clipped = corner.clip(inside.A, inside.b, torch.zeros_like(inside.b), no_source, most=inside.rows + 4)
 
     if by_norm:
         outward, touched = _arcs(admissible, limits[:, :1], around)
