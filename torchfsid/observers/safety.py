@@ -204,7 +204,7 @@ class SafetyObserver:
             robot = None if self.is_shared else place
             against = _rows(after.psi.contradiction, 0) if after.psi.any_empty else ()
             unexplained = tuple(items[after.theta.is_empty].tolist())
-            self.refutations.append(Refutation(t, robot, self._named(against), unexplained))
+            self.refutations.append(Refutation(t, robot, self._named(against, robot), unexplained))
             if robot is not None:
                 rows = _rows(after.theta.contradiction, 0) if after.theta.any_empty else ()
                 self._events.append(Event(t, robot, Status.INCONSISTENT, rows))
@@ -278,12 +278,19 @@ class SafetyObserver:
                 continue
             against = _rows(psi.contradiction, place) if bool(psi.is_empty[place]) else ()
             unexplained = (theta.is_empty & (owner == place)).nonzero().flatten()
-            self.refutations.append(Refutation(t, robot, self._named(against), tuple(self._of[unexplained].tolist())))
+            self.refutations.append(
+                Refutation(t, robot, self._named(against, robot), tuple(self._of[unexplained].tolist()))
+            )
 
-    def _named(self, rows: tuple[tuple[float, int], ...]) -> tuple[tuple[float, int, int], ...]:
-        """Half-planes of psi, given by time and source, as (time, robot, row). Those of the prior are left out."""
-        m = self._model_rows
-        return tuple((time, source // m % self.robots, source % m) for time, source in rows if source >= 0)
+    def _named(self, rows: tuple[tuple[float, int], ...], robot: int | None) -> tuple[tuple[float, int, int], ...]:
+        """Half-planes of psi, given by time and source, as (time, robot, row). Those of the prior are left out.
+
+        All rows of a single robot's Psi are its own.
+        """
+        m, team = self._model_rows, self.robots
+        return tuple(
+            (t, source // m % team if robot is None else robot, source % m) for t, source in rows if source >= 0
+        )
 
     def _fall_back(self) -> None:
         """Go on with the sets of the single robots."""
