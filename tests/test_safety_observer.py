@@ -104,6 +104,23 @@ def test_rows_that_are_never_active_say_nothing_of_the_largest_gain() -> None:
     assert team.holds_truth(observer)
 
 
+def test_rows_that_are_violated_are_soft_or_refute_the_truth() -> None:
+    """A controller with slack variables gives way by a fifth of what its row would take from the nominal control."""
+    team = crossing(1, robots=2, velocity=1e-3, size=0.0)
+    given_way = [
+        replace(m, u=m.u + 0.2 * (team.run.nominal[k] - m.u))
+        for k, m in enumerate(team.measurements)
+        if m.u is not None
+    ]
+    assert team.run.active.any()
+    soft = replace(team, unknown=replace(team.unknown, soft=True), measurements=given_way).watched()
+    soft.look_again(given_way)
+    assert team.holds_truth(soft)
+    assert soft.refutations == []
+    assert (soft.safety.volume() < 0.9 * team.unknown.prior(2).volume()).all()
+    assert not team.holds_truth(replace(team, measurements=given_way).watched())
+
+
 def blocks(team: Team) -> Possible:
     """All that follows from all samples read at once."""
     robots, model = len(team.theta), team.observer().model
