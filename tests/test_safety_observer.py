@@ -13,7 +13,8 @@ from tests.safety_teams import Team, crossing
 from torchfsid.errors import InconsistentError, InputError
 from torchfsid.identification.evidence import ObservationModel
 from torchfsid.identification.safety_parameters import Possible
-from torchfsid.observers.safety import SETTLED, SafetyObserver
+from torchfsid.observers.safety import SafetyObserver
+from torchfsid.observers.safety_sets import SETTLED
 from torchfsid.outcome import Status
 from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.barriers import Arena, SpeedPolygon
@@ -373,6 +374,7 @@ def test_a_log_in_float32() -> None:
     assert observer.safety.volume()[0] < 0.01 * team.unknown.prior(1).volume()[0]
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_what_is_refused() -> None:
     team = crossing(1, steps=1)
     prior = team.observer().prior
