@@ -7,7 +7,7 @@ from typing import no_type_check
 import numpy as np
 
 from torchfsid.kernels.compiled import item, launcher
-from torchfsid.kernels.polygon import after_in, before_in
+from torchfsid.kernels.ring import after_in, before_in
 
 
 @item
