@@ -373,6 +373,7 @@ def test_a_log_in_float32() -> None:
     assert observer.safety.volume()[0] < 0.01 * team.unknown.prior(1).volume()[0]
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_what_is_refused() -> None:
     team = crossing(1, steps=1)
     prior = team.observer().prior

@@ -201,8 +201,8 @@ def test_rows_hold_for_all_errors_within_their_bounds(form: dict, neighbour: str
                 assert ((rows.active.A @ point.mT).squeeze(-1) - rows.active.b).max() <= round_off
                 near = velocity + within.errors(seen, errors).slack
                 assert (within(seen).normalised().slack(control) <= near + 1e-12).all()
-            elif position == velocity == 0:
-                assert over[~holds].min() > -1e-9  # violated rows are cut off: not everything is allowed
+            elif position == velocity == 0 and (unknown.margin is None or unknown.distance == "euclidean"):
+                assert over[~holds].min() > -1e-9  # where q is exact, a violated row is cut off
 
 
 @pytest.mark.parametrize("form", FORMS, ids=str)

@@ -84,8 +84,11 @@ class AvoidanceWithin:
     unknown: UnknownAvoidance
     psi: Float[Tensor, "B v 2"]
     _looks: list[_Look] = field(init=False, default_factory=list, repr=False, compare=False)
-    soft: ClassVar[bool] = True
     uncertain: ClassVar[bool] = True
+
+    @property
+    def soft(self) -> bool:
+        return True
 
     @property
     def neighbour_velocity(self) -> NeighbourVelocity:
