@@ -202,7 +202,7 @@ def test_rows_hold_for_all_errors_within_their_bounds(form: dict, neighbour: str
                 near = velocity + within.errors(seen, errors).slack
                 assert (within(seen).normalised().slack(control) <= near + 1e-12).all()
             elif position == velocity == 0 and (unknown.margin is None or unknown.distance == "euclidean"):
-                assert over[~holds].min() > -1e-9  # violated rows are cut off: not everything is allowed
+                assert over[~holds].min() > -1e-9  # where q is exact, a violated row is cut off
 
 
 @pytest.mark.parametrize("form", FORMS, ids=str)
