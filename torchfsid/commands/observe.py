@@ -157,7 +157,10 @@ class Observation:
                 ):
                     self._cases[robot].update([CASES[case]] if used else [])
             if isinstance(self.sets, SafetyObserver):
-                self.sets.look_again(list(self.declared.measurements()))
+                try:
+                    self.sets.look_again(list(self.declared.measurements()))
+                except InconsistentError as error:
+                    raise FsidError(self._named(error)) from error
 
     def _named(self, error: InconsistentError) -> str:
         """The error with the names of robot and rows."""

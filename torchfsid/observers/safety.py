@@ -164,6 +164,9 @@ class SafetyObserver:
         Args:
             measurements: what the observer has taken in.
             most: the largest number of cells into which each Psi is split.
+
+        Raises:
+            InconsistentError: see `update`.
         """
         if self.on_inconsistent == "reset" or len(measurements) == 0:
             return
@@ -176,7 +179,10 @@ class SafetyObserver:
             self._alone.look_again(measurements, most)
 
     def odd(self) -> list[int]:
-        """The robots without whom all others can have the same parameters. Empty if there is none, or no need."""
+        """The robots without whom all others can have the same parameters. Empty if there is none, or no need.
+
+        While the sets Psi are wide, several robots may be named. `look_again` narrows them.
+        """
         if not self.team_is_refuted:
             return []
         found, trusted = [], (self.status < Status.INCONSISTENT).tolist()

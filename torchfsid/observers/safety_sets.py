@@ -122,7 +122,11 @@ class SafetySets:
             self.update(measurement)
 
     def look_again(self, measurements: Sequence[Measurement], most: int) -> None:
-        """Read all measurements again, for smaller sets (`second_look`). Robots that are not OK keep theirs."""
+        """Read all measurements again, for smaller sets (`second_look`). Robots that are not OK keep theirs.
+
+        Raises:
+            InconsistentError: see `update`.
+        """
         if self.is_shared:
             self._look(torch.arange(self.robots), 0, measurements, most)
             return
@@ -145,6 +149,8 @@ class SafetySets:
                 rows = _rows_of(after.theta.contradiction, 0) if after.theta.any_empty else ()
                 self.events.append(Event(t, robot, Status.INCONSISTENT, rows))
                 self.status = torch.where(mine, Status.INCONSISTENT, self.status)
+                if self.on_inconsistent == "raise":
+                    raise InconsistentError(robot, t, rows)
             return
         of = torch.zeros_like(self.status).index_copy(0, items, torch.arange(len(items)))
         theta = after.theta.select(of).where(mine, before.theta)

@@ -202,7 +202,7 @@ def _joined(parts: Sequence[Samples]) -> tuple[Samples, ...]:
 def _around(unknown: UnknownAvoidance, before: Possible, cells: Sequence[Possible]) -> Possible:
     """Convex sets around the union of the cells, inside the sets before. EMPTY if there are no cells."""
     if len(cells) == 0:
-        nothing = Halfspaces(torch.zeros(1, 2), torch.full((1,), -1.0))
+        nothing = Halfspaces(torch.zeros(1, 2), torch.full((1,), -1.0), torch.full((1,), -1))
         return replace(before, psi=before.psi.intersect(nothing))
     if len(cells) == 1:
         return cells[0]
@@ -210,19 +210,23 @@ def _around(unknown: UnknownAvoidance, before: Possible, cells: Sequence[Possibl
     ratio = extremes(unknown.split(corners)[1])
     zero, one = torch.zeros_like(ratio[..., 0]), torch.ones_like(ratio[..., 0])
     rays = [torch.stack(pair, -1) for pair in ((one, zero), (-one, zero), (ratio[..., 0], -one), (-ratio[..., 1], one))]
-    psi = before.psi.intersect(_rows_around([cell.psi for cell in cells], torch.stack(rays, dim=-2)))
-    theta = before.theta.intersect(_rows_around([cell.theta for cell in cells]))
+    psi = before.psi.intersect(*_rows_around([cell.psi for cell in cells], torch.stack(rays, dim=-2)))
+    theta = before.theta.intersect(*_rows_around([cell.theta for cell in cells]))
     return replace(before, theta=theta, psi=psi)
 
 
-def _rows_around(sets: Sequence[FeasibleSet], more: Float[Tensor, "B k p"] | None = None) -> Halfspaces:
-    """Half-spaces around the union of sets, with the normals of all their facets, and `more`."""
+def _rows_around(
+    sets: Sequence[FeasibleSet], more: Float[Tensor, "B k p"] | None = None
+) -> tuple[Halfspaces, Float[Tensor, "B r"]]:
+    """Half-spaces around the union of sets, with the normals of all their facets, and `more`. And their times."""
     facets = [each.facets() for each in sets]
     normals, source = torch.cat([of.halfspaces.A for of in facets], dim=-2), torch.cat([of.source for of in facets], -1)
+    time = torch.cat([of.time for of in facets], dim=-1)
     if more is not None:
-        normals = torch.cat([normals, more], dim=-2)
-        source = torch.cat([source, torch.full(more.shape[:-1], -1)], dim=-1)
+        normals, unknown = torch.cat([normals, more], dim=-2), torch.full(more.shape[:-1], -1)
+        source, time = torch.cat([source, unknown], dim=-1), torch.cat([time, unknown * torch.nan], dim=-1)
     corners = torch.cat([each.vertices() for each in sets], dim=-2)
     reach = normals @ corners.mT
     round_off = ROUND_OFF * (normals.abs() @ corners.abs().mT).amax(-1)
-    return Halfspaces(normals, reach.amax(-1) + round_off, source).where((normals != 0).any(-1))
+    rows = Halfspaces(normals, reach.amax(-1) + round_off, source).where((normals != 0).any(-1))
+    return rows, time
