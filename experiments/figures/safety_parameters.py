@@ -2,85 +2,92 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from experiments.figures.style import INVERSE_OPTIMAL, ROBOT, STYLE, TEAM
+from experiments.figures.style import HYBRID, INVERSE_OPTIMAL, ROBOT, STYLE
 from experiments.results import Columns, read_columns, read_json
-from experiments.studies.safety_summary import half_widths, shrinking
+from experiments.studies.safety_summary import by_bound, by_time, half_widths
 
-LOOKS = {"gain": INVERSE_OPTIMAL, "safety distance": ROBOT}
+COLOURS = {"gain": INVERSE_OPTIMAL, "safety distance": ROBOT}
 DASHES = {"1": "-", "3": (0, (3, 1.5))}
-SHADES = {"1 s": "0.8", "2 s": "0.62", "4 s": "0.42", "looked": INVERSE_OPTIMAL}
-NAMES = {"streamed": "one pass", "looked": "second look"}
+STAGES = ("after 1 s", "after 2 s", "after 4 s", "at the end", "second look")
+SHADES = ("0.8", "0.62", "0.42", "0.2", INVERSE_OPTIMAL)
+SECONDS = {"1 s": 1.0, "2 s": 2.0, "4 s": 4.0, "streamed": 8.0}
+"""Places of the stages on the time axis; the last one is the end."""
+
+FLOOR = 1e-6
+"""Smaller excesses of diameters are round-off."""
 
 
 def draw_study(folder: Path) -> Figure:
     """The figure of the study, from its files."""
     sets, robots = read_columns(folder / "sets.csv"), read_columns(folder / "robots.csv")
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(7.2, 5.6), layout="constrained")
-        (example, cost), (by_bound, by_time) = figure.subplots(2, 2)
-        _draw_example(example, read_json(folder / "example.json"))
-        _draw_cost(cost, robots.rows(robots["part"] != "odd"))
-        _draw_bounds(by_bound, sets)
-        _draw_times(by_time, sets)
-        for axes, letter in zip(figure.axes, "abcd", strict=True):
-            axes.set_title(f"{letter})  {axes.get_title('left')}", loc="left")
+        figure = Figure(figsize=(7.2, 5.8), layout="constrained")
+        (example, cost), (bounds, times) = figure.subplots(2, 2)
+        _draw_example(example, _telling(read_json(folder / "shapes.json")))
+        _draw_cost(cost, robots.where(gain_prior=100.0).rows(robots.where(gain_prior=100.0)["part"] != "odd"))
+        _draw_widths(bounds, by_bound(sets), float)
+        bounds.set(xscale="log", xlabel="declared bound of velocities [m/s]", title="c)  Enclosures by bound")
+        _draw_widths(times, (group for group in by_time(sets) if group[0]["stage"] in SECONDS), SECONDS.__getitem__)
+        times.set(xscale="log", xlabel="t [s]", title="d)  Enclosures by time, bound 5 mm/s")
+        times.set_xticks(list(SECONDS.values()), ["1", "2", "4", "end"])
+        times.minorticks_off()
+        figure.legend(*bounds.get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return figure
 
 
-def _draw_example(axes: Axes, example: dict) -> None:
-    for stage, corners in example["sets"].items():
+def _telling(shapes: list[dict[str, Any]]) -> dict[str, Any]:
+    """The team with p = 1 whose Psi shrinks most nearly to a third between stages: all of them can be seen."""
+
+    def unlike(shape: dict[str, Any]) -> float:
+        extents = [np.ptp(np.array(corners), axis=0).prod() for corners in shape["sets"]]
+        return float(np.abs(np.diff(np.log(extents)) + np.log(3.0)).sum())
+
+    return min((shape for shape in shapes if shape["power"] == 1), key=unlike)
+
+
+def _draw_example(axes: Axes, shape: dict[str, Any]) -> None:
+    for stage, shade, corners in zip(STAGES, SHADES, shape["sets"], strict=True):
         gain, distance = np.array([*corners, corners[0]]).T
-        axes.plot(gain, distance, color=SHADES[stage], lw=1.2)
-        axes.fill(gain, distance, color=SHADES[stage], alpha=0.25, lw=0)
-        at = int(np.argmax(gain))
-        axes.annotate(stage, (gain[at], distance[at]), fontsize=7)
-    axes.plot(*example["truth"], "+", color=ROBOT, ms=8)
-    axes.set(xscale="log", xlabel="gain", ylabel="safety distance [m]", title="Ψ of one team")
+        axes.fill(gain, distance, color=shade, alpha=0.25, lw=0)
+        axes.plot(gain, distance, color=shade, lw=1.4, label=stage)
+    axes.plot(*shape["truth"], "+", color=ROBOT, ms=9, mew=1.5, label="truth")
+    axes.set(xlabel="gain", ylabel="safety distance [m]", title=f"a)  Ψ of a team of {shape['robots']}")
+    axes.margins(0.06)
+    axes.legend(loc="best", fontsize=7)
 
 
 def _draw_cost(axes: Axes, robots: Columns) -> None:
-    for (stage, name), colour in zip(NAMES.items(), (TEAM[3], INVERSE_OPTIMAL), strict=True):
-        more = np.sort(robots.numbers(stage) / robots.numbers("known") - 1)
-        axes.plot(np.clip(more, 1e-6, None), 1 - np.arange(len(more)) / len(more), color=colour, label=name, lw=1.6)
-    axes.set(
-        xscale="log", yscale="log", xlim=(1e-6, None), xlabel="diameter of Θ, unknown to known parameters, minus 1"
-    )
-    axes.set(ylabel="share of robots above", title=f"Cost in Θ ({len(robots['run'])} robots)")
+    known = robots.numbers("known")
+    for name, label, colour in (("streamed", "one pass", HYBRID), ("looked", "second look", INVERSE_OPTIMAL)):
+        excess = np.sort(robots.numbers(name) / known - 1)
+        left = 1 - np.arange(len(excess)) / len(excess)
+        axes.step(excess[excess > FLOOR], left[excess > FLOOR], color=colour, label=label, lw=1.6)
+    axes.axvline(0.1, color="0.6", lw=0.8, ls=(0, (1, 1)))
+    axes.set(xscale="log", yscale="log", xlim=(FLOOR, None), ylim=(0.5 / len(known), 1))
+    axes.set(xlabel="diameter of Θ, unknown / known Ψ, minus 1", ylabel="share of robots above")
+    axes.set_title(f"b)  Cost in Θ, {len(known)} robots")
     axes.grid(True)
     axes.legend()
 
 
-def _draw_bounds(axes: Axes, sets: Columns) -> None:
-    _draw_widths(axes, shrinking(sets, "velocity", stage="looked", gain_prior=100.0), float)
-    axes.set(xscale="log", xlabel="declared bound of velocities [m/s]", title="Enclosures by bound")
-
-
-def _draw_times(axes: Axes, sets: Columns) -> None:
-    seconds = {"1 s": 1.0, "2 s": 2.0, "4 s": 4.0, "streamed": 9.0}
-    sets = sets.rows(np.isin(sets["stage"], list(seconds)))
-    _draw_widths(axes, shrinking(sets, "stage", velocity=0.005, gain_prior=100.0), seconds.__getitem__)
-    axes.set(xscale="log", xlabel="t [s]", title="Enclosures by time, bound 5 mm/s")
-    axes.set_xticks([1, 2, 4, 9], ["1", "2", "4", "end"])
-    axes.minorticks_off()
-    axes.legend()
-
-
-def _draw_widths(axes: Axes, groups, place) -> None:
-    lines: dict[tuple[str, str], list[tuple[float, float, float, float]]] = {}
+def _draw_widths(axes: Axes, groups: Iterable[tuple[dict[str, str], Columns]], place: Callable[[str], float]) -> None:
+    lines: dict[tuple[str, str], list[tuple[float, ...]]] = {}
     for about, found in groups:
         power, value = about.values()
-        for name, widths in zip(LOOKS, half_widths(found), strict=True):
-            lines.setdefault((power, name), []).append((place(value), *np.quantile(widths, (0.1, 0.5, 0.9))))
+        for name, widths in zip(COLOURS, half_widths(found), strict=True):
+            lines.setdefault((power, name), []).append((place(value), *np.quantile(widths, (0.25, 0.5, 0.75))))
     for (power, name), points in lines.items():
         x, low, middle, high = np.array(sorted(points)).T
-        axes.fill_between(x, low, high, color=LOOKS[name], alpha=0.1, lw=0)
-        axes.plot(x, middle, color=LOOKS[name], ls=DASHES[power], lw=1.6, label=f"{name}, p = {power}")
+        axes.fill_between(x, low, high, color=COLOURS[name], alpha=0.12, lw=0)
+        axes.plot(x, middle, color=COLOURS[name], ls=DASHES[power], lw=1.6, label=f"{name}, p = {power}")
     axes.set(yscale="log", ylabel="half width / truth")
     axes.grid(True)

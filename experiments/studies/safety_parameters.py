@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from time import perf_counter
@@ -27,7 +27,7 @@ from torch import Tensor
 
 from experiments.figures.safety_parameters import draw_study
 from experiments.results import whole, write_rows
-from experiments.studies.safety_summary import as_markdown, tables
+from experiments.studies.safety_summary import TARGET, as_markdown, tables
 from experiments.studies.safety_teams import Form, Prior, Setting, Team, draw, logged
 from experiments.sweeps.journal import Journal
 from experiments.sweeps.workers import workers
@@ -103,7 +103,7 @@ def planned(teams: int) -> list[Run]:
 def record(run: Run, number: int, seed: int) -> dict[str, Any]:
     """Draw the team, log and observe it. The rows of the two tables."""
     torch.set_num_threads(1)
-    team = draw(run.form, np.random.default_rng((seed, number, 0)), (4, 4) if run.factor else (2, 5), run.factor)
+    team = drawn(run, number, seed)
     sets, robots, shapes = [], [], []
     for variant, (setting, prior) in enumerate(run.observed):
         log = logged(team, setting, np.random.default_rng((seed, number, 1)))
@@ -118,6 +118,12 @@ def record(run: Run, number: int, seed: int) -> dict[str, Any]:
         sets += [about | row for row in of_sets]
         robots += [about | row for row in of_robots]
     return {"run": number, "sets": sets, "robots": robots, "shapes": shapes}
+
+
+def drawn(run: Run, number: int, seed: int) -> Team:
+    """The team of a run."""
+    robots = (4, 4) if run.factor else (2, 5)
+    return draw(run.form, np.random.default_rng((seed, number, 0)), robots, run.factor)
 
 
 def observed(
@@ -143,11 +149,46 @@ def observed(
     odd, differs = learner.odd(), team.differs.tolist()
     diameters = zip(*map(Tensor.tolist, (known, streamed, learner.feasible_set.diameter())), strict=True)
     of_robots = [
-        {"robot": i, **dict(zip(("known", "streamed", "looked"), of_robot, strict=True)), "seconds": took}
+        {
+            "robot": i,
+            "reached": "",
+            **dict(zip(("known", "streamed", "looked"), of_robot, strict=True)),
+            "seconds": took,
+        }
         | {"differs": differs[i], "named": i in odd}
         for i, of_robot in enumerate(diameters)
     ]
     return stages, of_robots
+
+
+def reached(run: Run, number: int, seed: int, variant: int) -> tuple[tuple[int, int], list[float]]:
+    """The diameters of Theta that known parameters at the corners of Psi reach together, where they explain the data.
+
+    They bound the diameters for unknown parameters from below.
+    """
+    torch.set_num_threads(1)
+    team, (setting, prior) = drawn(run, number, seed), run.observed[variant]
+    measurements = list(logged(team, setting, np.random.default_rng((seed, number, 1))).measurements())
+    learner = team.learner(setting, prior)
+    for sample in measurements:
+        learner.update(sample)
+    learner.look_again(measurements)
+    corners, unknown = learner.safety.vertices()[0].unique(dim=0), learner.model.unknown
+    beta, D = unknown.split(torch.lerp(corners, corners.mean(0), 1e-3))
+    vertices = []
+    for gain, distance in zip((beta**unknown.power).tolist(), unknown.length(D).tolist(), strict=True):
+        guess = replace(team, gain=torch.full_like(team.gain, gain), distance=distance).knowing(setting)
+        for sample in measurements:
+            guess.update(sample)
+        if bool((guess.status == Status.OK).all()):
+            vertices.append(guess.feasible_set.vertices())
+    together = torch.cat(vertices, dim=-2) if vertices else torch.zeros(team.robots, 1, 2, dtype=torch.float64)
+    return (number, variant), torch.cdist(together, together).amax((-1, -2)).tolist()
+
+
+def of_runs(rows: Sequence[dict[str, Any]]) -> list[tuple[int, int]]:
+    """The runs and variants to which the rows belong."""
+    return sorted({(row["run"], row["variant"]) for row in rows})
 
 
 def stage(learner: SafetyObserver, team: Team, name: str) -> dict[str, Any]:
@@ -205,6 +246,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for done in track(team(record, calls), "Learning", len(runs), len(runs) - len(missing)):
             journal.add(done)
         records = [journal.records[number] for number in runs]
+        large = [row for each in records for row in each["robots"] if row["looked"] > TARGET * row["known"]]
+        large = [row for row in large if row["part"] != "odd"]
+        calls = ((runs[number], number, chosen.seed, variant) for number, variant in of_runs(large))
+        found = dict(track(team(reached, calls), "Checking large sets", len(of_runs(large))))
+    for row in large:
+        row["reached"] = found[row["run"], row["variant"]][row["robot"]]
     for name in ("sets", "robots"):
         write_rows(chosen.out / f"{name}.csv", (row for each in records for row in each[name]))
     shapes = [shape for each in records for shape in each["shapes"]]

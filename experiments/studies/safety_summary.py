@@ -23,10 +23,13 @@ def tables(folder: Path) -> Iterator[tuple[str, list[dict[str, Any]]]]:
     sets, robots = read_columns(folder / "sets.csv"), read_columns(folder / "robots.csv")
     yield "What is lost, by errors", list(_losses(sets, robots))
     yield "Diameters of Theta: unknown to known parameters", list(_ratios(robots))
+    reached = robots.numbers("reached") / robots.numbers("looked")
+    checked = {"robots": int((~np.isnan(reached)).sum()), "reached by known parameters": int((reached > 0.9).sum())}
+    yield f"Ratios above {TARGET}", [checked]
     yield "Enclosures, by form", list(_enclosures(sets))
-    yield "Enclosures, by bound", list(_by_bound(sets))
-    yield "Enclosures, by time", list(_by_time(sets))
-    yield "Enclosures, by prior", list(_by_prior(sets))
+    yield "Enclosures, by bound", _told(by_bound(sets))
+    yield "Enclosures, by time", _told(by_time(sets))
+    yield "Enclosures, by prior", _told(_by_prior(sets))
     yield "One robot with another gain", list(_odd(sets, robots))
     yield "Seconds", [_seconds(sets, robots)]
 
@@ -68,7 +71,7 @@ def _losses(sets: Columns, robots: Columns) -> Iterator[dict[str, Any]]:
 
 
 def _ratios(robots: Columns) -> Iterator[dict[str, Any]]:
-    robots = robots.rows((robots["part"] != "odd"))
+    robots = robots.rows(robots["part"] != "odd")
     for prior, stage in product(sorted({*robots["gain_prior"]}, key=float), ("streamed", "looked")):
         chosen = robots.where(gain_prior=prior)
         ratio = chosen.numbers(stage) / chosen.numbers("known")
@@ -121,26 +124,31 @@ def _widths(sets: Columns) -> dict[str, float]:
     } | {f"{name} by data": float((sets[f"{name}_by_data"] == "True").mean()) for name in ("gain", "distance")}
 
 
-def shrinking(sets: Columns, by: str, **chosen: object) -> Iterator[tuple[dict[str, str], Columns]]:
-    """The teams of this part of the study in which rows are active, by power and another column."""
-    sets = with_active_rows(sets.where(part="shrinking", **chosen))
+def by_power(sets: Columns, by: str) -> Iterator[tuple[dict[str, str], Columns]]:
+    """The teams whose rows are active, by power and another column."""
+    sets = with_active_rows(sets)
     for power, value in product("13", dict.fromkeys(sets[by])):
-        yield {"power": power, by: value}, sets.where(power=power, **{by: value})
+        found = sets.where(power=power, **{by: value})
+        if len(found["run"]):
+            yield {"power": power, by: value}, found
 
 
-def _by_bound(sets: Columns) -> Iterator[dict[str, Any]]:
-    for about, found in shrinking(sets, "velocity", stage="looked", gain_prior=100.0):
-        yield about | {"teams": len(found["run"])} | _widths(found)
+def by_bound(sets: Columns) -> Iterator[tuple[dict[str, str], Columns]]:
+    """The same teams with several bounds."""
+    return by_power(sets.where(part="shrinking", stage="looked", gain_prior=100.0), "velocity")
 
 
-def _by_time(sets: Columns) -> Iterator[dict[str, Any]]:
-    for about, found in shrinking(sets, "stage", velocity=0.005, gain_prior=100.0):
-        yield about | {"teams": len(found["run"])} | _widths(found)
+def by_time(sets: Columns) -> Iterator[tuple[dict[str, str], Columns]]:
+    """Teams with a bound of 5 mm/s at several times."""
+    return by_power(sets.where(errors="tenth", position=0.0, velocity=0.005, gain_prior=100.0), "stage")
 
 
-def _by_prior(sets: Columns) -> Iterator[dict[str, Any]]:
-    for about, found in shrinking(sets, "gain_prior", stage="looked", velocity=0.005):
-        yield about | {"teams": len(found["run"])} | _widths(found)
+def _by_prior(sets: Columns) -> Iterator[tuple[dict[str, str], Columns]]:
+    return by_power(sets.where(part="shrinking", stage="looked", velocity=0.005), "gain_prior")
+
+
+def _told(groups: Iterator[tuple[dict[str, str], Columns]]) -> list[dict[str, Any]]:
+    return [about | {"teams": len(found["run"])} | _widths(found) for about, found in groups]
 
 
 def _odd(sets: Columns, robots: Columns) -> Iterator[dict[str, Any]]:
@@ -166,6 +174,8 @@ def _seconds(sets: Columns, robots: Columns) -> dict[str, Any]:
 
 def as_markdown(title: str, rows: list[dict[str, Any]]) -> str:
     """A table as in docs/safety_parameters.md."""
+    if not rows:
+        return f"\n{title}: no teams"
     lines = [f"\n{title}\n", f"| {' | '.join(rows[0])} |", "|---" * len(rows[0]) + "|"]
     lines += [f"| {' | '.join(f'{v:.4g}' if isinstance(v, float) else str(v) for v in row.values())} |" for row in rows]
     return "\n".join(lines)

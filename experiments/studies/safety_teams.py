@@ -1,7 +1,7 @@
 """Random teams whose gain and safety distance are drawn, what is logged of them, and what is declared.
 
-True motions are exact. Errors are in the logged velocities, and in the logged positions if asked for. A velocity that is
-exactly zero, since a QP is infeasible, is logged as such.
+True motions are exact. Errors are in the logged velocities, and in the logged positions if asked for. A velocity that
+is exactly zero, since a QP is infeasible, is logged as such.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ class Setting:
     """What is wrong with the logged data.
 
     Attributes:
-        errors: the shape of the errors of velocities. `exact`: none. `tenth`: uniform in a disc of a tenth of the bound.
-            The others reach the bound. `uniform`: in a disc. `circle`: random directions. `fixed`: one direction per
+        errors: the shape of the errors of velocities. `exact`: none. `tenth`: uniform in a disc of a tenth of the
+            bound. The others reach the bound. `uniform`: in a disc. `circle`: random directions. `fixed`: one for each
             robot. `alternating`: towards and away from the robot's nearest row in turn. `adversarial`: see `_worst`.
         velocity: the declared bound of velocities [m/s].
         position: the declared bound of positions, which errors in random directions reach [m].
