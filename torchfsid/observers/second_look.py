@@ -39,6 +39,10 @@ ROUNDS = 3
 SHRUNK = 0.95
 """Samples are read again while that leaves less than this fraction of Psi."""
 
+LEAST_SHARE = 1e-3
+"""A line divides Psi only if it leaves at least this fraction of the width on either side. A wide Psi has its small
+gains, which differ most in the speeds that they allow, in such a corner."""
+
 BESIDE = 1e-9
 """A split is moved to the permissive side by this fraction of the width of Psi, so that no row stays on its line."""
 
@@ -78,7 +82,7 @@ class Cell:
     def split(self) -> tuple[Cell, Cell] | None:
         """Two cells, one on each side of the line of an undecided row that divides Psi best. None if there is none."""
         corners = self.possible.psi.vertices()[0]
-        best: tuple[float, int, int, int] = (0.02, -1, -1, -1)
+        best: tuple[float, int, int, int] = (LEAST_SHARE, -1, -1, -1)
         for k, samples in enumerate(self.samples):
             items, rows = samples.undecided.nonzero().unbind(-1)
             if len(items) == 0:
