@@ -17,8 +17,9 @@ from experiments.studies.safety_summary import by_bound, by_time, half_widths
 
 COLOURS = {"gain": INVERSE_OPTIMAL, "safety distance": ROBOT}
 DASHES = {"1": "-", "3": (0, (3, 1.5))}
-STAGES = ("after 1 s", "after 2 s", "after 4 s", "at the end", "second look")
-SHADES = ("0.8", "0.62", "0.42", "0.2", INVERSE_OPTIMAL)
+STAGES = {0: ("after 1 s", "0.8"), 1: ("after 2 s", "0.4"), -1: ("second look", INVERSE_OPTIMAL)}
+"""Those that are drawn of a team's sets, their labels and colours."""
+
 SECONDS = {"1 s": 1.0, "2 s": 2.0, "4 s": 4.0, "streamed": 8.0}
 """Places of the stages on the time axis; the last one is the end."""
 
@@ -45,24 +46,25 @@ def draw_study(folder: Path) -> Figure:
 
 
 def _telling(shapes: list[dict[str, Any]]) -> dict[str, Any]:
-    """The team with p = 1 whose Psi shrinks most nearly to a third between stages: all of them can be seen."""
+    """The team with p = 1 whose Psi shrinks most nearly to a third between the stages drawn: all can be seen."""
 
     def unlike(shape: dict[str, Any]) -> float:
-        extents = [np.ptp(np.array(corners), axis=0).prod() for corners in shape["sets"]]
+        extents = [np.ptp(np.array(shape["sets"][place]), axis=0).prod() for place in STAGES]
         return float(np.abs(np.diff(np.log(extents)) + np.log(3.0)).sum())
 
     return min((shape for shape in shapes if shape["power"] == 1), key=unlike)
 
 
 def _draw_example(axes: Axes, shape: dict[str, Any]) -> None:
-    for stage, shade, corners in zip(STAGES, SHADES, shape["sets"], strict=True):
+    for place, (stage, shade) in STAGES.items():
+        corners = shape["sets"][place]
         gain, distance = np.array([*corners, corners[0]]).T
         axes.fill(gain, distance, color=shade, alpha=0.25, lw=0)
         axes.plot(gain, distance, color=shade, lw=1.4, label=stage)
     axes.plot(*shape["truth"], "+", color=ROBOT, ms=9, mew=1.5, label="truth")
     axes.set(xlabel="gain", ylabel="safety distance [m]", title=f"a)  Ψ of a team of {shape['robots']}")
-    axes.margins(0.06)
-    axes.legend(loc="best", fontsize=7)
+    axes.margins(0.12)
+    axes.legend(loc="lower right", fontsize=7)
 
 
 def _draw_cost(axes: Axes, robots: Columns) -> None:

@@ -262,7 +262,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         partial.write_text(json.dumps(summary, indent=1), encoding="utf-8")
     for title, rows in summary.items():
         print(as_markdown(title, rows))
-    draw_study(chosen.out).savefig(chosen.out / "figure.png")
+    draw_study(chosen.out).savefig(chosen.out / "figure.png", dpi=200)
     return 0
 
 
