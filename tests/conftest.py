@@ -11,8 +11,9 @@ from matplotlib.figure import Figure
 # On tensors this small torch is many times slower with more threads. They are no part of what is tested.
 torch.set_num_threads(1)
 
-# A shell's background job ignores SIGINT and hands this down: the commands under test would ignore it, too.
+# A shell's background job ignores SIGINT, and nohup SIGHUP, and both hand this down to the commands under test.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.fixture

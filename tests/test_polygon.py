@@ -47,7 +47,7 @@ def cut(
     polygon: Polygon, A: np.ndarray | Tensor, b: np.ndarray | Tensor, time: float = 0.0, most: int = 1000
 ) -> Clipped:
     A, b = torch.as_tensor(A), torch.as_tensor(b)
-    stamp, source = torch.full((len(b),), time, dtype=torch.float64), torch.arange(b.shape[1]).expand(b.shape)
+    stamp, source = torch.full(b.shape, time, dtype=torch.float64), torch.arange(b.shape[1]).expand(b.shape)
     return polygon.clip(A, b, stamp, source, most)
 
 

@@ -52,7 +52,7 @@ def _telling(shapes: list[dict[str, Any]]) -> dict[str, Any]:
         extents = [np.ptp(np.array(shape["sets"][place]), axis=0).prod() for place in STAGES]
         return float(np.abs(np.diff(np.log(extents)) + np.log(3.0)).sum())
 
-    return min((shape for shape in shapes if shape["power"] == 1), key=unlike)
+    return min([shape for shape in shapes if shape["power"] == 1] or shapes, key=unlike)
 
 
 def _draw_example(axes: Axes, shape: dict[str, Any]) -> None:

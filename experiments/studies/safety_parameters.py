@@ -193,15 +193,14 @@ def of_runs(rows: Sequence[dict[str, Any]]) -> list[tuple[int, int]]:
 
 def stage(learner: SafetyObserver, team: Team, name: str) -> dict[str, Any]:
     """Where the observer stands: enclosures of the gain and the safety distance, statuses, and what is lost."""
-    unknown, possible = learner.model.unknown, learner.possible
+    unknown, hypotheses = learner.model.unknown, [learner.of_single_robots]
+    if learner.is_shared and not bool(team.differs.any()):
+        hypotheses.append(learner.possible)
     first = learner.safety.select(torch.zeros(1, dtype=torch.long))
     gain, distance = (ends[0].tolist() for ends in unknown.intervals(first))
     by_data = [bool(ends.all()) for ends in unknown.bounded_by_data(first)]
-    robot = torch.arange(len(possible.owner)) % team.robots
-    goals_held = possible.theta.contains(team.goals[robot])
-    psi_held = possible.psi.select(possible.owner).contains(team.psi[robot])
-    if learner.is_shared and bool(team.differs.any()):
-        goals_held, psi_held = goals_held[team.robots :], psi_held[team.robots :]
+    goals_held = torch.cat([sets.theta.contains(team.goals) for sets in hypotheses])
+    psi_held = torch.cat([sets.psi.select(sets.owner).contains(team.psi) for sets in hypotheses])
     return {
         "stage": name,
         "gain": float(team.gain.median()),

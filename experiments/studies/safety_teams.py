@@ -53,13 +53,6 @@ DIRECTIONS = 8
 Errors = Literal["exact", "tenth", "uniform", "circle", "fixed", "alternating", "adversarial"]
 
 
-class GainOfEach(ClassK):
-    """A class-K function with a gain for each robot."""
-
-    def __post_init__(self) -> None:
-        """The gains are positive."""
-
-
 @dataclass(frozen=True)
 class Form:
     """The known form of a barrier."""
@@ -135,7 +128,7 @@ class Team:
     def barrier(self) -> CollisionAvoidance:
         """The true barrier."""
         form = self.form
-        class_k = GainOfEach(self.gain.unsqueeze(-1), form.power)
+        class_k = ClassK(self.gain.unsqueeze(-1), form.power)
         return CollisionAvoidance(class_k, self.distance, distance=form.distance, neighbour_velocity=form.rows)
 
     @property

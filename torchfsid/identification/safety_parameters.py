@@ -88,20 +88,24 @@ class Cuts:
         """The part of each Psi inside its own half-planes. `times` are those of the items [s]."""
         if len(self.item) == 0:
             return psi
-        of = owner[self.item % len(owner)]
-        order = of.argsort(stable=True)
-        of, sets = of[order], psi.batch_shape[0]
-        counts = torch.bincount(of, minlength=sets)
-        place = torch.arange(len(of), device=of.device) - (counts.cumsum(0) - counts)[of]
-        most = int(counts.max())
         assert self.rows.source is not None
-        A = self.rows.A.new_zeros(sets, most, 2).index_put((of, place), self.rows.A[order])
-        b = self.rows.b.new_ones(sets, most).index_put((of, place), self.rows.b[order])
-        source = torch.full((sets, most), -1).index_put((of, place), self.rows.source[order])
+        A, b, source, items = self.rows.A, self.rows.b, self.rows.source, self.item
+        sets = psi.batch_shape[0]
+        if sets == 1:
+            stamps = times[items] if isinstance(times, Tensor) else times
+            return psi.intersect(Halfspaces(A[None], b[None], source[None]), stamps)
+        of = owner[items % len(owner)]
+        order = of.argsort(stable=True)
+        of, items, counts = of[order], items[order], torch.bincount(of, minlength=sets)
+        place, most = torch.arange(len(of), device=of.device) - (counts.cumsum(0) - counts)[of], int(counts.max())
+        rows = Halfspaces(
+            A.new_zeros(sets, most, 2).index_put((of, place), A[order]),
+            b.new_ones(sets, most).index_put((of, place), b[order]),
+            torch.full((sets, most), -1).index_put((of, place), source[order]),
+        )
         if not isinstance(times, Tensor):
-            return psi.intersect(Halfspaces(A, b, source), times)
-        stamps = A.new_full((sets, most), torch.nan).index_put((of, place), times[self.item[order]])
-        return psi.intersect(Halfspaces(A, b, source), stamps)
+            return psi.intersect(rows, times)
+        return psi.intersect(rows, A.new_full((sets, most), torch.nan).index_put((of, place), times[items]))
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ from torchfsid.robots.unknown_avoidance import UnknownAvoidance
 from torchfsid.sets.feasible_set import FeasibleSet
 from torchfsid.tolerances import ACTIVE_TOLERANCE
 
-LAG = 16
+LAG = 64
 """Samples by which the single robots' sets may lag behind while those of the team are shown."""
 
 
@@ -106,6 +106,12 @@ class SafetyObserver:
     def possible(self) -> Possible:
         """The sets shown: Theta of every robot, and Psi of the team or of every robot."""
         return self._shown.possible
+
+    @property
+    def of_single_robots(self) -> Possible:
+        """The sets of robots that share nothing: Theta of every robot, and Psi of every robot."""
+        self._catch_up()
+        return self._alone.possible
 
     @property
     def feasible_set(self) -> FeasibleSet:

@@ -57,22 +57,23 @@ class SafetyRows(NamedTuple):
 
 
 class _At(NamedTuple):
-    """Distances r [m], the least and the largest q there, and the extremes of w over Psi for the least q."""
+    """Distances r [m], the least and the largest q there, and w over Psi for the least q: its extremes and mean."""
 
     r: Float[Tensor, "B m"]
     least: Float[Tensor, "B m"]
     largest: Float[Tensor, "B m"]
-    reach: tuple[Float[Tensor, "B m"], Float[Tensor, "B m"]]
+    reach: tuple[Float[Tensor, "B m"], Float[Tensor, "B m"], Float[Tensor, "B m"]]
 
 
 class _Look(NamedTuple):
-    """The geometry of a measurement, |grad h|, and alpha(h) at the mean of the vertices."""
+    """The geometry of a measurement, |grad h|, alpha(h) at the mean of the vertices, and how well bodies are seen."""
 
     measurement: Measurement
     seen: Geometry
     at: _At
     size: Float[Tensor, "B m"]
     typical: Float[Tensor, "B m"]
+    sights: list[tuple[Sight, _At, _At]]
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,7 @@ class AvoidanceWithin:
         unknown.pattern.require_monotone("bodies are left out")
         nearest = torch.where(left_out.distance.isfinite(), left_out.distance, 1.0).unsqueeze(-1)
         r = (nearest * (1 - ROUND_OFF)).clamp(min=NEAREST)
-        least, _ = self._reach(self._q(measurement, r, left_out.radius.unsqueeze(-1))[0])
+        least, _, _ = self._reach(self._q(measurement, r, left_out.radius.unsqueeze(-1))[0])
         phi = (spow(least, unknown.power) / unknown.size(r)).squeeze(-1)
         speed = u.norm(dim=-1)
         if self.neighbour_velocity != "none":
@@ -151,8 +152,8 @@ class AvoidanceWithin:
         slack = slack + sight.loose + round_off
         low = spow((closing - slack) * unknown.size(farthest.r), 1 / unknown.power)
         high = spow((closing + slack) * unknown.size(nearest.r), 1 / unknown.power)
-        known = measurement.present & sight.clear & low.isfinite() & high.isfinite() & nearest.least.isfinite()
-        least, largest = nearest.reach
+        known = measurement.present & sight.clear & (low + high + nearest.least).isfinite()
+        least, largest, _ = nearest.reach
         smallest = least if farthest.largest is nearest.least else self._reach(farthest.largest.detach())[0]
         cuts, undecided = known & (smallest < low), known & (least <= high) & (largest > high)
         return SafetyRows(farthest.largest, low, nearest.least, high, cuts, undecided)
@@ -163,21 +164,24 @@ class AvoidanceWithin:
         if last is None or last.measurement is not measurement:
             seen = self.unknown.pattern.geometry(measurement)
             at = self._at(measurement, seen.r)
-            w = lines(self.psi.mean(-2, keepdim=True), (at.least + at.largest) / 2).squeeze(-1)
             size = self.unknown.size(seen.r).clamp(min=NEAREST)
-            last = _Look(measurement, seen, at, size, spow(w, self.unknown.power))
+            last = _Look(measurement, seen, at, size, spow(at.reach[2], self.unknown.power), [])
             self._looks[:] = [last]
         return last
 
     def _sight(self, look: _Look, measurement: Measurement, bounds: ErrorBounds) -> tuple[Sight, _At, _At]:
-        """How well the bodies are seen, and q at their least and at their largest distances."""
+        """How well the bodies are seen, and q at their least and at their largest distances. Kept like `_look`."""
+        if look.sights:
+            return look.sights[0]
         pattern = self.unknown.pattern
         sight = pattern.sight(measurement, bounds, look.seen)
-        if not bool(sight.e.any()):
-            return sight, look.at, look.at
-        pattern.require_monotone("positions have errors")
-        nearest = self._at(measurement, (sight.r - sight.e).clamp(min=NEAREST))
-        return sight, nearest, self._at(measurement, sight.r + sight.e)
+        nearest = farthest = look.at
+        if bool(sight.e.any()):
+            pattern.require_monotone("positions have errors")
+            nearest = self._at(measurement, (sight.r - sight.e).clamp(min=NEAREST))
+            farthest = self._at(measurement, sight.r + sight.e)
+        look.sights.append((sight, nearest, farthest))
+        return look.sights[0]
 
     def _at(self, measurement: Measurement, r: Float[Tensor, "B m"]) -> _At:
         least, largest = self._q(measurement, r)
@@ -207,8 +211,15 @@ class AvoidanceWithin:
         low, high = extremes(self.unknown.length(self.unknown.split(self.psi)[1])).unsqueeze(-2).unbind(-1)
         return low, high
 
-    def _reach(self, q: Float[Tensor, "B k"]) -> tuple[Float[Tensor, "B k"], Float[Tensor, "B k"]]:
-        """The least and the largest w over Psi, with their round-off."""
+    def _reach(
+        self, q: Float[Tensor, "B k"]
+    ) -> tuple[Float[Tensor, "B k"], Float[Tensor, "B k"], Float[Tensor, "B k"]]:
+        """The least and the largest w over Psi, with their round-off, and w at the mean of the vertices."""
         w = lines(self.psi, q)
-        round_off = ROUND_OFF * (self.psi[..., 0].amax(-1, keepdim=True) * q.abs() + w.abs().amax(-1))
-        return w.amin(-1) - round_off, w.amax(-1) + round_off
+        least, largest = torch.aminmax(w, dim=-1)
+        round_off = ROUND_OFF * (self._largest_beta * q.abs() + torch.maximum(-least, largest))
+        return least - round_off, largest + round_off, w.mean(-1)
+
+    @cached_property
+    def _largest_beta(self) -> Float[Tensor, "B 1"]:
+        return self.psi[..., 0].amax(-1, keepdim=True)
