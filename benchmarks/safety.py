@@ -10,14 +10,14 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 
 from benchmarks import save
 from torchfsid.identification.safety_parameters import LearningModel, Possible
-from torchfsid.observers.consistency import BLOCK, Consistency
+from torchfsid.observers.consistency import Consistency
 from torchfsid.observers.safety import SafetyObserver
-from torchfsid.observers.safety_sets import SafetySets
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.bounds import NoiseBound
@@ -73,17 +73,16 @@ def main(arguments: list[str]) -> None:
 
     told = seconds(watched(lambda: SetMembershipObserver(TASK, known, prior, noise=noise)), chosen.repeats)
     learning = seconds(watched(lambda: SafetyObserver(TASK, unknown, prior, noise)), chosen.repeats)
-    blocks = [samples[k : k + BLOCK] for k in range(0, len(samples), BLOCK)]
     consistency = Consistency(samples, TASK, known, prior)
     bound = torch.full((4,), ERROR, dtype=torch.float64)
     told_pass = seconds(lambda: consistency.sets(bound), chosen.repeats)
 
     def learning_pass() -> None:
         model = LearningModel(TASK, unknown, noise)
-        start = Possible(prior, unknown[0].prior(1), torch.zeros(4, dtype=torch.long))
-        sets = SafetySets(model, start, "hold", None)
-        for block in blocks:
-            sets.update_all(block)
+        sets = Possible(prior, unknown[0].prior(1), torch.zeros(4, dtype=torch.long))
+        for block in consistency.blocks:
+            read = model.read(sets, block.measurement)
+            sets = replace(sets, theta=read.theta, psi=read.cuts.apply(sets.psi, sets.owner, block.of_items))
 
     learned_pass = seconds(learning_pass, chosen.repeats)
     looks = [_second_look(samples, unknown, prior, noise) for _ in range(chosen.repeats)]
