@@ -93,6 +93,7 @@ def test_equal_ends_are_known_values(form: dict) -> None:
         assert psi.contains(psi_of(unknown, *ends.unbind(-1)).unsqueeze(1)).all()
         found = unknown.intervals(psi)
         torch.testing.assert_close(found.gain[0], tensor(*gain), rtol=1e-9, atol=0)
+        assert gain[0] < gain[1] or torch.equal(found.gain[0], tensor(*gain))  # a known gain is printed as it is
         torch.testing.assert_close(found.distance[0], tensor(*length), rtol=1e-7, atol=0)
         by_data = unknown.bounded_by_data(psi)
         assert by_data[0].all() == (gain[0] == gain[1] and length[0] == length[1])
@@ -153,6 +154,14 @@ def test_an_end_is_bounded_by_data_if_a_wider_prior_leaves_it(form: dict) -> Non
         assert torch.equal(by_data, stays)
         counted += int(stays.sum())
     assert 0 < counted < 4 * len(rows.b)
+
+
+def test_small_values_far_inside_a_huge_prior_are_bounded_by_data() -> None:
+    """An end counts as that of the prior for its distance from it, not for its size beside the whole prior."""
+    unknown = UnknownAvoidance((1e-3, 1e5), (1e-3, 1e3))
+    A = torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.09, -1.0], [-0.16, 1.0]], dtype=torch.float64)
+    psi = unknown.prior(1).intersect(Halfspaces(A, tensor(0.06, -0.05, 0.0, 0.0)))
+    assert all(bool(by_data.all()) for by_data in unknown.bounded_by_data(psi))
 
 
 @pytest.mark.parametrize("neighbour", ["none", "current"])

@@ -226,3 +226,24 @@ def test_intervals_are_rounded_outward() -> None:
     assert ends([53.389, 669.393], [False, True]) == "53* .. 670"
     assert ends([0.9999789, 1.0000211]) == "0.999978 .. 1.000022"
     assert ends([0.015, 150.0]) == "0.015 .. 150"
+
+
+def test_what_no_parameters_explain_is_not_called_a_difference_between_robots(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With a wrong gain of the task every robot is refuted by itself, and none is the odd one."""
+    out = observe(log, tmp_path, CONFIG | {"task": {"kind": "goal", "gain": 4 * KP}})
+    said, regions = capsys.readouterr().out, json.loads((out / "regions.json").read_text())
+    assert {robot["status"] for robot in regions["robots"].values()} == {"inconsistent"}
+    assert regions["odd"] == []
+    assert "something else in the model or the prior is wrong" in said
+    assert "no theta in the prior explains the motion of" in said
+    assert "without" not in said
+
+
+def test_check_does_not_rule_out_that_the_intervals_are_wrong(log: Path, tmp_path: Path) -> None:
+    config = CONFIG | {"barriers": [AVOIDANCE | {"class_k": {"gain": [2 * GAIN, 3 * GAIN]}}]}
+    found = check_safety(DeclaredLog(validate(config, ObserveConfig, "config"), read_csv(log)))
+    assert found is not None
+    assert "declared intervals" in found.conclusion()
+    assert "they are wrong, robots differ" in found.conclusion()

@@ -70,7 +70,12 @@ class SafetyCheck:
     def conclusion(self) -> str:
         """The verdict as a sentence."""
         if self.free is None:
-            return f"no gain and {self.what} common to all robots explain the log: something else in the model is wrong"
+            is_interval = self.gain is None
+            within, causes = ("of the declared intervals ", "they are wrong, ") if is_interval else ("", "")
+            return (
+                f"no gain and {self.what} {within}common to all robots explain the log: {causes}robots differ, "
+                "or something else in the model is wrong"
+            )
         allowed = f"the log allows gain {ends(self.free.gain, self.free.gain_by_data)} and {self.what} " + (
             f"{ends(self.free.distance, self.free.distance_by_data)} m"
         )

@@ -16,6 +16,7 @@ from torchfsid.commands.results import seconds
 from torchfsid.commands.task_gain import TaskGain
 from torchfsid.commands.terminal import digits, ends, table
 from torchfsid.observers.safety import SafetyObserver
+from torchfsid.outcome import Status
 
 MOST_COLUMNS = 4
 """Models beyond which the table of hypotheses has a line, not a column, for each."""
@@ -84,14 +85,20 @@ def _print_safety(observer: SafetyObserver, robots: Sequence[str], labels: Seque
         rows = dict.fromkeys(
             f"{robots[robot]} {labels[row]} at {seconds(time)}" for time, robot, row in refutation.rows
         )
-        rows.update(dict.fromkeys(f"the motion of {robots[robot]}" for robot in refutation.unexplained))
         whose = (
             "the team has no safety parameters in common"
             if refutation.robot is None
-            else (f"no safety parameters explain {robots[refutation.robot]}")
+            else f"no safety parameters explain {robots[refutation.robot]}"
         )
-        against = f"; these contradict each other: {', '.join(rows)}" if rows else ""
-        console.print(escape(f"{whose}, found at {seconds(refutation.t)}{against}"), soft_wrap=True)
+        reasons = [f"these contradict each other: {', '.join(rows)}"] if rows else []
+        if refutation.unexplained:
+            whom = ", ".join(robots[robot] for robot in refutation.unexplained)
+            reasons.append(f"no theta in the prior explains the motion of {whom} with those that are left")
+        console.print(escape("; ".join([f"{whose}, found at {seconds(refutation.t)}", *reasons])), soft_wrap=True)
+    if bool((observer.status >= Status.INCONSISTENT).all()):
+        console.print(
+            "no robot is explained by any safety parameters: something else in the model or the prior is wrong"
+        )
     if odd := [robots[robot] for robot in observer.odd()]:
         names = odd[0] if len(odd) == 1 else f"one of {', '.join(odd)}"
         console.print(escape(f"without {names} the others can have the same parameters"))
@@ -120,7 +127,9 @@ def print_hypotheses(hypotheses: Hypotheses, out: Path, console: Console) -> Non
         column.justify = "left"
     console.print(verdicts)
     for name, observation in hypotheses.observations.items():
-        if isinstance(observation.sets, SafetyObserver) and observation.sets.team_is_refuted:
+        sets = observation.sets
+        explains_some = bool((sets.status < Status.INCONSISTENT).any())
+        if isinstance(sets, SafetyObserver) and sets.team_is_refuted and explains_some:
             console.print(escape(f"{name}: the robots have no safety parameters in common, each has its own"))
     _print_bound(console, hypotheses.smallest_bounds, hypotheses.velocity_bound)
     console.print(escape(f"Results: {out}/hypotheses.json, and a folder for each of {', '.join(names)}"))

@@ -26,6 +26,9 @@ TEAM = "0.25"
 WIDE = 20.0
 """Ratio of the ends of a range beyond which its axis is logarithmic."""
 
+NARROW = 1e-9
+"""Fraction of the values below which the pairs' width is round-off, and is not spread over the axes."""
+
 
 def draw_safety(out: Path) -> list[Path]:
     """Draw safety.png and safety.pdf from the files of the results folder.
@@ -108,9 +111,14 @@ def _draw_pairs(axes: Axes, final: dict[str, dict[str, Any]], label: str) -> Non
         gain = beta ** safety["power"]
         axes.fill(gain, length, facecolor=_colour(name, i), alpha=0.3, lw=0, label=plain_name(name))
         axes.plot(gain, length, color=_colour(name, i), lw=1.2)
+        axes.plot(gain[:1], length[:1], ".", color=_colour(name, i), ms=4)  # for a set that is a point
     gains = np.array([safety["gain"] for safety in final.values()])
     if gains.max() > WIDE * gains.min():
         axes.set_xscale("log")
+    for (low, high), widen in ((axes.dataLim.intervalx, axes.set_xlim), (axes.dataLim.intervaly, axes.set_ylim)):
+        size = max(abs(low), abs(high))
+        if high - low < NARROW * size:  # a known value: its round-off is not drawn as a polygon
+            widen(low - 0.1 * size, high + 0.1 * size)
     axes.set(xlabel="gain", ylabel=label, title="Pairs that are left")
     axes.margins(0.15)
     axes.grid(color="0.93", lw=0.6)
@@ -125,7 +133,7 @@ def _draw_pairs(axes: Axes, final: dict[str, dict[str, Any]], label: str) -> Non
         axes.text(0.5, 0.98, f"not bounded by the data:\n{', '.join(ends)}", transform=axes.transAxes, ha="center",
                   va="top", fontsize=8, color="0.35")  # fmt: skip
     if 1 < len(final) <= MOST_NAMED:
-        axes.legend(title="robot", fontsize=8, loc="lower left")
+        axes.legend(title="robot", fontsize=8, loc="best")
 
 
 def _draw_band(axes: Axes, final: dict[str, dict[str, Any]]) -> None:
@@ -141,7 +149,7 @@ def _draw_band(axes: Axes, final: dict[str, dict[str, Any]]) -> None:
         bottom = min(min(low for _, low, _ in safety["approach_speed"]) for safety in final.values())
         axes.set_ylim(max(bottom - 0.1 * fastest, -2 * fastest), 2 * fastest)
         relevant = [r for safety in final.values() for r, least, _ in safety["approach_speed"] if least < 2 * fastest]
-        axes.set_xlim(right=max(relevant, default=None))
+        axes.set_xlim(min(relevant, default=None), max(relevant, default=None))
     axes.axhline(0.0, color="0.6", lw=0.8)
     axes.set(xlabel="distance r [m]", ylabel="speed [m/s]", title="Allowed speed of approach")
     axes.grid(color="0.93", lw=0.6)

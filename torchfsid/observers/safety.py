@@ -191,11 +191,11 @@ class SafetyObserver:
         """
         if not self.team_is_refuted:
             return []
-        found, trusted = [], (self.status < Status.INCONSISTENT).tolist()
+        found, lost = [], (self.status >= Status.INCONSISTENT).nonzero().flatten().tolist()
         facets = self.safety.facets().halfspaces
         for robot in range(self.robots):
-            others = [i for i in range(self.robots) if i != robot and trusted[i]]
-            if others:
+            others = [i for i in range(self.robots) if i != robot]
+            if others and not set(lost) - {robot}:
                 rows = Halfspaces(facets.A[others].flatten(0, 1)[None], facets.b[others].flatten()[None])
                 if not self.safety.select(torch.tensor(others[:1])).intersect(rows).any_empty:
                     found.append(robot)

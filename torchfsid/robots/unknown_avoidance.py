@@ -134,7 +134,8 @@ class UnknownAvoidance:
     def intervals(self, psi: FeasibleSet) -> SafetyIntervals:
         """The gains and distances that each set Psi allows. NaN for an EMPTY set."""
         beta, D = self.split(psi.vertices().detach())
-        return SafetyIntervals(extremes(beta**self.power), extremes(self.length(D)))
+        gain, distance = (beta**self.power).clamp(*self.gain), self.length(D).clamp(*self.declared)
+        return SafetyIntervals(extremes(gain), extremes(distance))
 
     def bounded_by_data(self, psi: FeasibleSet) -> tuple[Bool[Tensor, "*batch 2"], Bool[Tensor, "*batch 2"]]:
         """Whether the ends of the two intervals come from data alone.
@@ -145,7 +146,8 @@ class UnknownAvoidance:
         at_prior = torch.zeros_like(beta, dtype=torch.bool)
         for values, (low, high) in ((beta, self.betas), (D, self.distances)):
             if low < high:
-                close = 1e-6 * (high - low)
+                least, largest = extremes(values).unsqueeze(-2).unbind(-1)
+                close = 1e-6 * (largest - least) + 1e-9 * values.abs()  # not of high - low, which may be huge
                 at_prior = at_prior | (values <= low + close) | (values >= high - close)
 
         def free_ends(values: Tensor) -> Tensor:
