@@ -18,7 +18,7 @@ from torchfsid import (
     SetMembershipObserver,
     simulate,
 )
-from torchfsid.config.barriers import AvoidanceConfig, ClassKConfig
+from torchfsid.config.barriers import AvoidanceConfig, UnknownClassKConfig
 from torchfsid.errors import ConfigError, InputError
 from torchfsid.robots.affine_barrier import AffineBarrier
 from torchfsid.robots.avoidance import ClassK
@@ -77,7 +77,7 @@ def test_a_team_whose_joint_controller_failed_says_nothing() -> None:
 
 def test_a_body_may_have_a_distance_of_its_own() -> None:
     x = torch.tensor([[0.0, 0.0], [2.0, 0.0], [0.0, 3.0]], dtype=torch.float64)
-    config = AvoidanceConfig(safety_distance=0.5, safety_distances={"wide": 1.5}, class_k=ClassKConfig(gain=2.0))
+    config = AvoidanceConfig(safety_distance=0.5, safety_distances={"wide": 1.5}, class_k=UnknownClassKConfig(gain=2.0))
     rows = config.build(["ego", "narrow", "wide"])(Measurement.of_team(0.0, x))
     assert rows.b[0, 1:].tolist() == [2.0 * (4.0 - 0.25), 2.0 * (9.0 - 2.25)]
     assert rows.b[1, [0, 2]].tolist() == [2.0 * (4.0 - 0.25), 2.0 * (13.0 - 2.25)]

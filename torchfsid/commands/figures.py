@@ -85,7 +85,7 @@ def draw_observation(out: Path, x: np.ndarray, seen: np.ndarray, bodies: Sequenc
         grid = figure.add_gridspec(2, 2, width_ratios=(1.25, 1), height_ratios=(2.2, 1))
         _draw_map(figure.add_subplot(grid[:, 0]), final, x, seen, bodies)
         size = figure.add_subplot(grid[0, 1])
-        _draw_sizes(size, history)
+        _draw_sizes(size, history, final)
         _draw_cases(figure.add_subplot(grid[1, 1], sharex=size), history)
 
     return render(out / "regions", (10.5, 5.2), draw)
@@ -121,7 +121,10 @@ def _regions(path: Path) -> dict[str, Any]:
     try:
         robots = json.loads(path.read_text(encoding="utf-8"))["robots"]
         needed = ("vertices", "centroid", "diameter", "status")
-        return {robot: {name: region[name] for name in needed} for robot, region in robots.items()}
+        return {
+            robot: {**{name: region[name] for name in needed}, "read_again": "safety" in region}
+            for robot, region in robots.items()
+        }
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise FigureError(f"{path}: missing or damaged: {one_line(error)}") from error
 
@@ -208,10 +211,15 @@ def _draw_map(axes: Axes, final: dict, x: np.ndarray, seen: np.ndarray, bodies: 
     axes.set_axisbelow(True)
 
 
-def _draw_sizes(axes: Axes, history: dict[str, dict[str, np.ndarray]]) -> None:
+def _draw_sizes(axes: Axes, history: dict[str, dict[str, np.ndarray]], final: dict[str, Any]) -> None:
     for i, (robot, of) in enumerate(history.items()):
         axes.plot(thinned(of["t"]), thinned(of["diameter"]), color=colour(i), lw=1.5, label=plain_name(robot))
-    sizes = np.concatenate([of["diameter"] for of in history.values()])
+    last = [final[robot]["diameter"] or math.nan for robot in history if final[robot]["read_again"]]
+    if last:
+        for i, (size, of) in enumerate(zip(last, history.values(), strict=True)):
+            axes.plot(of["t"][-1], size, "o", color=colour(i), ms=5, clip_on=False)
+        axes.plot([], [], "o", color="0.4", ms=5, label="read again")
+    sizes = np.concatenate([*(of["diameter"] for of in history.values()), last])
     sizes = sizes[sizes > 0]
     if len(sizes) and sizes.max() > 2 * sizes.min():
         axes.set_yscale("log")

@@ -127,6 +127,9 @@ def print_hypotheses(hypotheses: Hypotheses, out: Path, console: Console) -> Non
         column.justify = "left"
     console.print(verdicts)
     for name, observation in hypotheses.observations.items():
+        if observation.task_gain is not None:
+            console.print(f"[bold]{escape(name)}[/]: ", end="")
+            _print_task_gain(observation.task_gain, console)
         sets = observation.sets
         explains_some = bool((sets.status < Status.INCONSISTENT).any())
         if isinstance(sets, SafetyObserver) and sets.team_is_refuted and explains_some:

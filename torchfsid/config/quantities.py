@@ -87,10 +87,18 @@ def known(value: float | tuple[float, ...] | None) -> float | None:
     return value
 
 
+FARTHEST_APART = 1e12
+"""Ratio of the ends of an interval beyond which sets over it would lose their digits."""
+
+
 def require_interval(name: str, value: float | tuple[float, ...] | None) -> None:
-    """Check, in a validator, that an interval has low <= high."""
-    if isinstance(value, tuple) and not value[0] <= value[1]:
+    """Check, in a validator, that an interval has low <= high, and ends that are not too far apart."""
+    if not isinstance(value, tuple):
+        return
+    if not value[0] <= value[1]:
         raise wrong(f"expected [low, high] with low <= high, got {list(value)}", name)
+    if value[1] > FARTHEST_APART * value[0] > 0:
+        raise wrong(f"expected ends at most a factor {FARTHEST_APART:g} apart, got {list(value)}", name)
 
 
 def require_box(lower: Sequence[float], upper: Sequence[float]) -> None:
