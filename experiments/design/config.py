@@ -9,30 +9,21 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from experiments.runs.config import Text, WholeNumber
+from experiments.runs.config import Count, Text, WholeNumber, require_steps
 from experiments.teams import TeamConfig
 from torchfsid.config.barriers import AvoidanceConfig
 from torchfsid.config.documents import Strict, wrong
-from torchfsid.config.observers import UkfConfig
+from torchfsid.config.observers import PriorConfig, UkfConfig
 from torchfsid.config.quantities import NonNegative, Number, PlanarVector, Positive, known
 
-Count = Annotated[int, Field(strict=True, ge=1)]
 Several = Annotated[int, Field(strict=True, ge=2)]
-MAX_STEPS = 100_000
-"""More is a slip of the pen in dt or duration."""
 
 
-class BoxConfig(Strict):
+class BoxConfig(PriorConfig):
     """A rectangle [m]."""
 
     lower: PlanarVector
     upper: PlanarVector
-
-    @model_validator(mode="after")
-    def _is_a_box(self) -> BoxConfig:
-        if not all(low < high for low, high in zip(self.lower, self.upper, strict=True)):
-            raise wrong(f"expected lower < upper, got {list(self.lower)} and {list(self.upper)}")
-        return self
 
 
 class DesignConfig(Strict):
@@ -72,8 +63,7 @@ class DesignConfig(Strict):
 
     @model_validator(mode="after")
     def _can_be_run(self) -> DesignConfig:
-        if not 1 <= self.duration / self.dt <= MAX_STEPS:
-            raise wrong(f"expected 1 to {MAX_STEPS} steps of dt = {self.dt} s, got {self.duration} s", "duration")
+        require_steps(self.duration, self.dt)
         if self.avoidance.margin is not None or self.avoidance.safety_distances:
             raise wrong("bodies have no names and no radius here: give one safety_distance", "avoidance")
         if self.avoidance.is_unknown:

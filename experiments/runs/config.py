@@ -30,6 +30,7 @@ MAX_STEPS = 1_000_000
 
 Text = Annotated[str, Field(min_length=1)]
 WholeNumber = Annotated[int, Field(strict=True, ge=0)]
+Count = Annotated[int, Field(strict=True, ge=1)]
 
 
 class RobotConfig(Strict):
@@ -142,6 +143,9 @@ class ExperimentConfig(Strict):
         for i, barrier in enumerate(self.barriers):
             if barrier.is_unknown:
                 raise wrong("expected numbers, not [low, high]: robots that are simulated have them", f"barriers[{i}]")
+        if len(self.prior.lower) != self.task.parameters:
+            raise wrong(f"a goal has {self.task.parameters} entries, lower has {len(self.prior.lower)}", "prior")
+        require_steps(self.duration, self.dt)
         return self
 
     def build_sets(self, kind: SetKind, task: Task, barriers: Sequence[Barrier], robots: int) -> SetMembershipObserver:
@@ -157,18 +161,20 @@ class ExperimentConfig(Strict):
             task, barriers, prior, kind=kind, noise=noise, active_tolerance=self.active_tolerance
         )
 
-    @model_validator(mode="after")
-    def _fits_the_task(self) -> ExperimentConfig:
-        if len(self.prior.lower) != self.task.parameters:
-            raise wrong(f"a goal has {self.task.parameters} entries, lower has {len(self.prior.lower)}", "prior")
-        if not 1 <= self.duration / self.dt <= MAX_STEPS:
-            raise wrong(f"expected 1 to {MAX_STEPS} steps of dt = {self.dt} s, got {self.duration} s", "duration")
-        return self
-
     def _require_in_prior(self, goal: Sequence[float], path: str) -> None:
         bounds = zip(self.prior.lower, goal, self.prior.upper, strict=True)
         if not all(low <= x <= high for low, x, high in bounds):
             raise wrong(f"the prior does not hold it: {list(goal)}", path)
+
+    def _require_no_radii(self, bodies: str) -> None:
+        for i, barrier in enumerate(self.barriers):
+            if barrier.uses_radius:
+                raise wrong(f"bodies of a {bodies} have no radius: give safety_distance", f"barriers[{i}].margin")
+
+    def _require_in_time(self, snapshots: Sequence[float]) -> None:
+        require_increasing(snapshots, "snapshots")
+        if snapshots[-1] > self.duration:
+            raise wrong(f"must not be after the end, {self.duration} s, got {snapshots[-1]}", "snapshots")
 
 
 class SceneConfig(ExperimentConfig):
@@ -203,16 +209,8 @@ class SceneConfig(ExperimentConfig):
             raise wrong(f"two bodies are called {repeated[0]!r}", "robots, obstacles")
         for i, robot in enumerate(self.robots):
             self._require_in_prior(robot.goal, f"robots[{i}].goal")
-        for i, barrier in enumerate(self.barriers):
-            if barrier.uses_radius:
-                raise wrong("bodies of a scene have no radius: give safety_distance", f"barriers[{i}].margin")
-        require_increasing(self.snapshots, "snapshots")
-        if self.snapshots[-1] > self.duration:
-            raise wrong(f"must not be after the end, {self.duration} s, got {self.snapshots[-1]}", "snapshots")
-        self._check_expected()
-        return self
-
-    def _check_expected(self) -> None:
+        self._require_no_radii("scene")
+        self._require_in_time(self.snapshots)
         if self.expected and len(self.robots) > 1:
             raise wrong("only a scene of one robot has an expected timeline", "expected")
         require_increasing([interval.until for interval in self.expected], "expected")
@@ -220,6 +218,7 @@ class SceneConfig(ExperimentConfig):
         for i, interval in enumerate(self.expected):
             if unknown := [name for name in interval.active or () if name not in obstacles]:
                 raise wrong(f"no obstacle is called {unknown[0]!r}", f"expected[{i}].active")
+        return self
 
 
 class CaseBodyConfig(Strict):
@@ -308,11 +307,11 @@ class SwarmConfig(ExperimentConfig):
     """
 
     kind: Literal["swarm"]
-    robots: Annotated[int, Field(strict=True, ge=1)]
+    robots: Count
     side: Positive
     separation: NonNegative
     travel: Positive
-    neighbours: Annotated[int, Field(strict=True, ge=1)]
+    neighbours: Count
     sensing_radius: Positive
     seed: WholeNumber
     measurement_noise: MeasurementNoiseConfig = MeasurementNoiseConfig()
@@ -334,12 +333,15 @@ class SwarmConfig(ExperimentConfig):
         for i, barrier in enumerate(self.barriers):
             if barrier.neighbour_velocity == "current":
                 raise wrong("no joint QP over a swarm: none or previous", f"barriers[{i}].neighbour_velocity")
-            if barrier.uses_radius:
-                raise wrong("bodies of a swarm have no radius: give safety_distance", f"barriers[{i}].margin")
-        require_increasing(self.snapshots, "snapshots")
-        if self.snapshots[-1] > self.duration:
-            raise wrong(f"must not be after the end, {self.duration} s, got {self.snapshots[-1]}", "snapshots")
+        self._require_no_radii("swarm")
+        self._require_in_time(self.snapshots)
         return self
+
+
+def require_steps(duration: float, dt: float) -> None:
+    """Check, in a validator, that a run has a number of steps that can be run."""
+    if not 1 <= duration / dt <= MAX_STEPS:
+        raise wrong(f"expected 1 to {MAX_STEPS} steps of dt = {dt} s, got {duration} s", "duration")
 
 
 def require_increasing(times: Sequence[float], path: str) -> None:
