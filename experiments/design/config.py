@@ -73,16 +73,16 @@ class DesignConfig(Strict):
         return self
 
 
-class GoalsConfig(Strict):
-    """Numbers of random goals.
+class NumbersConfig(Strict):
+    """How many random goals or teams there are.
 
     Attributes:
-        train: goals to search with.
-        validation: goals to choose among finalists.
-        test: goals to report on.
+        train: those to search with, or to train on.
+        validation: those to choose among finalists, or to stop the training and to tune by hand.
+        test: those to report on.
     """
 
-    train: Several
+    train: Count
     validation: Count
     test: Count
 
@@ -155,7 +155,7 @@ class ProbePlacementConfig(DesignConfig):
     set: Literal["critical_region", "inverse_optimal"]
     active_tolerance: Positive = 1e-3
     velocity_noise: NonNegative = 1e-2
-    goals: GoalsConfig
+    goals: NumbersConfig
     search: SearchConfig
     landscape: tuple[Several, Several]
     gradient_check: GradientCheckConfig
@@ -168,23 +168,11 @@ class ProbePlacementConfig(DesignConfig):
             raise wrong("expected 1 among them: the landscape is that of a probe that stands still", "way_points")
         if self.search.finalists > self.search.starts * self.search.steps:
             raise wrong("more than there are placements", "search.finalists")
+        if self.goals.train < 2:
+            raise wrong("expected several, whose mean is taken", "goals.train")
         if max(self.gradient_check.horizons) > self.steps:
             raise wrong(f"a run has {self.steps} samples", "gradient_check.horizons")
         return self
-
-
-class TeamsConfig(Strict):
-    """Numbers of random teams.
-
-    Attributes:
-        train: teams to train on.
-        validation: teams to stop the training and to tune by hand.
-        test: teams to compare on.
-    """
-
-    train: Count
-    validation: Count
-    test: Count
 
 
 class TrainingConfig(Strict):
@@ -219,7 +207,7 @@ class LearnedObserverConfig(DesignConfig):
 
     kind: Literal["learned_observer"]
     team: TeamConfig
-    teams: TeamsConfig
+    teams: NumbersConfig
     noise: Annotated[tuple[Positive, ...], Field(min_length=1)]
     unseen_noise: Annotated[tuple[Positive, ...], Field(min_length=1)]
     gains: Annotated[tuple[Positive, ...], Field(min_length=1)]

@@ -92,12 +92,12 @@ class Probing:
     @property
     def prior(self) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
         """Lower and upper corner of Theta_0 [m]."""
-        return _box(self.config.prior)
+        return _corners(self.config.prior)
 
     @property
     def room(self) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
         """Lower and upper corner of the room for way-points [m]."""
-        return _box(self.config.room)
+        return _corners(self.config.room)
 
     @property
     def prior_area(self) -> float:
@@ -175,8 +175,7 @@ class Probing:
 
     def prior_of(self, items: int) -> FeasibleSet:
         """Theta_0, once for each item."""
-        lower, upper = self.prior
-        return FeasibleSet.from_box(lower.expand(items, 2), upper.expand(items, 2))
+        return self.config.prior.build(items)
 
     def left(
         self, placements: Float[Tensor, "P K 2"] | None, goals: Float[Tensor, "S 2"], steps: int | None = None
@@ -253,5 +252,6 @@ def _by_item(rows: Halfspaces, used: Bool[Tensor, "T B"]) -> Halfspaces:
     return Halfspaces(A.flatten(1, 2), b.flatten(1, 2))
 
 
-def _box(box: BoxConfig) -> tuple[Tensor, Tensor]:
-    return torch.tensor(box.lower, dtype=torch.float64), torch.tensor(box.upper, dtype=torch.float64)
+def _corners(box: BoxConfig) -> tuple[Tensor, Tensor]:
+    (lower,), (upper,) = box.corners(1)
+    return lower, upper

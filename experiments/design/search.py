@@ -75,8 +75,9 @@ class Search:
 
     @classmethod
     def of(cls, probing: Probing, goals: Float[Tensor, "S 2"], way_points: int, seed: np.random.SeedSequence) -> Search:
-        """A search with the predicted path for these goals, and random numbers from `seed`."""
-        return cls(probing, goals, predicted_path(probing, goals), way_points, np.random.default_rng(seed))
+        """A search with random numbers from `seed`. The predicted path is the mean over goals, without a probe."""
+        path = probing.run(None, goals).x.mean(1)
+        return cls(probing, goals, path, way_points, np.random.default_rng(seed))
 
     def anywhere(self, count: int) -> Float[Tensor, "P K 2"]:
         """Way-points drawn uniformly from the room [m]."""
@@ -95,9 +96,8 @@ class Search:
         spread = config.search.spread
         if K == 1:
             at = torch.from_numpy(self.random.integers(T, size=(count, 1)))
-            return self.probing.allowed(
-                self.path[at] + spread * torch.from_numpy(self.random.normal(size=(count, 1, 2)))
-            )
+            away = spread * torch.from_numpy(self.random.normal(size=(count, 1, 2)))
+            return self.probing.allowed(self.path[at] + away)
         at = torch.linspace(0, T - 1, K).round().long()
         turns = self.random.normal(size=(count, K)) * TURN
         turns[:, 0] = self.random.uniform(0, 2 * np.pi, size=count)
@@ -110,11 +110,6 @@ class Search:
         """The area for every placement and goal [m^2], without gradients."""
         with torch.no_grad():
             return self.probing.left(placements, self.goals).area
-
-
-def predicted_path(probing: Probing, goals: Float[Tensor, "S 2"]) -> Float[Tensor, "T 2"]:
-    """The mean path of the robot over its possible goals, without a probe [m]."""
-    return probing.run(None, goals).x.mean(1)
 
 
 def drawn(draw: Callable[[Search, int], Tensor]) -> Callable[[Search], Evaluated]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Annotated, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -18,12 +18,6 @@ from torchfsid.config.documents import Strict, wrong
 from torchfsid.config.observers import NoiseConfig, PriorConfig, UkfConfig
 from torchfsid.config.quantities import BodyName, NonNegative, Number, PlanarVector, Positive, known
 from torchfsid.config.tasks import GoalConfig
-
-if TYPE_CHECKING:
-    from torchfsid.identification.evidence import SetKind
-    from torchfsid.observers.set_membership import SetMembershipObserver
-    from torchfsid.robots.barriers import Barrier
-    from torchfsid.robots.tasks import Task
 
 MAX_STEPS = 1_000_000
 """More is a slip of the pen in dt or duration."""
@@ -147,19 +141,6 @@ class ExperimentConfig(Strict):
             raise wrong(f"a goal has {self.task.parameters} entries, lower has {len(self.prior.lower)}", "prior")
         require_steps(self.duration, self.dt)
         return self
-
-    def build_sets(self, kind: SetKind, task: Task, barriers: Sequence[Barrier], robots: int) -> SetMembershipObserver:
-        """The observer of one kind of set.
-
-        The critical region uses the active tolerance as its only bound, also to decide on alarms.
-        """
-        from torchfsid.observers.set_membership import SetMembershipObserver
-
-        noise = self.noise.build() if kind == "inverse_optimal" else None
-        prior = self.prior.build(robots)
-        return SetMembershipObserver(
-            task, barriers, prior, kind=kind, noise=noise, active_tolerance=self.active_tolerance
-        )
 
     def _require_in_prior(self, goal: Sequence[float], path: str) -> None:
         bounds = zip(self.prior.lower, goal, self.prior.upper, strict=True)
