@@ -110,6 +110,12 @@ class Probing:
         lower, upper = self.prior
         return lower + (upper - lower) * torch.quasirandom.SobolEngine(2, True, seed).draw(count, dtype=torch.float64)
 
+    def grid(self, columns: int, rows: int) -> Float[Tensor, "places 2"]:
+        """Centres of the cells of a grid over the room, row by row [m]."""
+        lower, upper = self.room
+        x, y = ((torch.arange(count, dtype=torch.float64) + 0.5) / count for count in (columns, rows))
+        return lower + (upper - lower) * torch.cartesian_prod(y, x).flip(-1)
+
     def allowed(self, placements: Float[Tensor, "P K 2"]) -> Float[Tensor, "P K 2"]:
         """The nearest allowed placements [m].
 

@@ -5,6 +5,7 @@ the smallest mean areas, are compared on the validation goals. The best of them 
 that no method has seen.
 
     one_random    a place drawn from the room; nothing is compared
+    grid          the best of as many places on a grid over the room, for a probe that stands still
     random        the best of as many places drawn from the room
     near_path     the best of as many places drawn near the path predicted without a probe
     cem           the cross-entropy method: generations from a Gaussian fitted to the best of the generation before
@@ -125,6 +126,18 @@ def drawn(draw: Callable[[Search, int], Tensor]) -> Callable[[Search], Evaluated
     return method
 
 
+def grid(search: Search) -> Evaluated:
+    """The method that evaluates places on a grid of about square cells."""
+    found, settings = Evaluated(), search.probing.config.search
+    lower, upper = search.probing.room
+    width, height = (upper - lower).tolist()
+    columns = max(1, round((settings.starts * settings.steps * width / height) ** 0.5))
+    places = search.probing.grid(columns, settings.starts * settings.steps // columns)
+    for chunk in search.probing.allowed(places.unsqueeze(1)).split(settings.starts):
+        found.add(chunk, search.evaluate(chunk))
+    return found
+
+
 def cem(search: Search) -> Evaluated:
     """The cross-entropy method (R. Rubinstein, 1999), axis by axis. Its first generation is near the predicted path."""
     found, settings = Evaluated(), search.probing.config.search
@@ -193,6 +206,7 @@ def _descend(
 
 
 METHODS: dict[str, Callable[[Search], Evaluated]] = {
+    "grid": grid,
     "random": drawn(Search.anywhere),
     "near_path": drawn(Search.near_path),
     "cem": cem,

@@ -239,24 +239,19 @@ class CasesConfig(ExperimentConfig):
     Attributes:
         start: start of the robot, in every case [m].
         goal: goal of the robot, in every case [m].
+        barriers: the only barrier. The places of the bodies follow from its rows.
         radius: radius of the robot [m].
         spin: angular rate at which the directions turn [deg/s].
         cases: the cases.
     """
 
     kind: Literal["cases"]
+    barriers: tuple[AvoidanceConfig]
     start: PlanarVector
     goal: PlanarVector
     radius: Positive
     spin: Number = 0.0
     cases: Annotated[tuple[CaseConfig, ...], Field(min_length=1)]
-
-    @property
-    def avoidance(self) -> AvoidanceConfig:
-        """The only barrier. The places of the bodies follow from its rows."""
-        barrier = self.barriers[0]
-        assert isinstance(barrier, AvoidanceConfig)
-        return barrier
 
     @model_validator(mode="after")
     def _is_a_table(self) -> CasesConfig:
@@ -264,8 +259,8 @@ class CasesConfig(ExperimentConfig):
         names = [case.name for case in self.cases]
         if repeated := [name for i, name in enumerate(names) if name in names[:i]]:
             raise wrong(f"two cases are called {repeated[0]!r}", "cases")
-        barrier = self.barriers[0]
-        if len(self.barriers) > 1 or not isinstance(barrier, AvoidanceConfig) or barrier.margin is None:
+        (barrier,) = self.barriers
+        if barrier.margin is None:
             raise wrong("expected one avoidance barrier with a margin", "barriers")
         if (barrier.distance, barrier.class_k.power, barrier.neighbour_velocity) != ("squared", 1, "none"):
             raise wrong("expected the paper's row: squared, power 1, neighbour_velocity none", "barriers[0]")

@@ -18,6 +18,7 @@ from experiments.runs.recording import Recording
 from torchfsid.commands.results import ResultsWriter
 from torchfsid.commands.safety_results import without_repeats
 from torchfsid.observers.set_membership import SetEstimate
+from torchfsid.programmes.differentiable import times
 from torchfsid.robots.barriers import stack_barriers
 from torchfsid.robots.measurement import Measurement
 
@@ -43,7 +44,7 @@ def _regions(recording: Recording, measurement: Measurement, sets: dict[str, Set
     real = (rows.A != 0).any(-1)
     active = next(iter(sets.values())).kkt.active
     C, d = recording.task(measurement)
-    nominal = (C @ recording.goals.unsqueeze(-1)).squeeze(-1) + d
+    nominal = times(C, recording.goals) + d
     vertices = {kind: estimate.feasible_set.vertices() for kind, estimate in sets.items()}
     for i, robot in enumerate(recording.robots):
         yield {

@@ -14,17 +14,15 @@ from torch import Tensor
 
 from experiments.runs.config import ExpectedConfig, ExperimentConfig, SceneConfig
 from experiments.runs.lengths import lengths, prior_lengths
-from experiments.runs.observers import Observers
 from experiments.runs.saved import Results
+from experiments.runs.tally import Tally
 from torchfsid.robots.simulation import Trajectory
 
 SHARES = (0.1, 0.01)
 
 
-def summarise_scene(results: Results, observers: Observers, true: Trajectory) -> dict[str, Any]:
+def summarise_scene(config: SceneConfig, results: Results, tally: Tally, true: Trajectory) -> dict[str, Any]:
     """The content of summary.json."""
-    config, tally = observers.config, observers.tally
-    assert isinstance(config, SceneConfig)
     active = {robot: [at[i].active for at in results.regions] for i, robot in enumerate(results.robots)}
     measures, before = lengths(results), prior_lengths(results)
 
