@@ -142,17 +142,9 @@ class Probing:
         noise = NoiseBound(config.velocity_noise) if config.set == "inverse_optimal" else None
         return ObservationModel(controller.task, controller.barriers, config.set, noise, config.active_tolerance)
 
-    def loop(
-        self, placements: Float[Tensor, "P K 2"] | None, goals: Float[Tensor, "S 2"], steps: int | None = None
-    ) -> Iterator[Sample]:
-        """The robot in closed loop, with every placement and every goal: P x S items.
-
-        Args:
-            placements: way-points [m], or None for no probe (S items).
-            goals: goals [m].
-            steps: number of samples. Default: the whole run.
-        """
-        bodies = self._bodies(placements, steps or self.config.steps).repeat_interleave(len(goals), dim=1)
+    def loop(self, placements: Float[Tensor, "P K 2"] | None, goals: Float[Tensor, "S 2"]) -> Iterator[Sample]:
+        """The robot in closed loop, with every placement [m] (None: no probe) and every goal [m]: P x S items."""
+        bodies = self._bodies(placements, self.config.steps).repeat_interleave(len(goals), dim=1)
         (T, B), dt, present = bodies.shape[:2], self.config.dt, torch.ones(bodies.shape[1:3], dtype=torch.bool)
 
         def around(t: float, x: Tensor, _: Tensor) -> Measurement:

@@ -33,7 +33,6 @@ class Rollouts:
     Attributes:
         steps: the input of an adaptive observer, sample by sample.
         goals: the true goals [m].
-        noise: bound of the disturbance [m/s].
         theta: centre of the prior [m].
         information: information matrix of the prior.
         estimates: estimates (T, B, 2) by observer [m]: `centroid`, and with filters `ukf` and `hybrid`.
@@ -42,7 +41,6 @@ class Rollouts:
 
     steps: list[Step]
     goals: Float[Tensor, "B 2"]
-    noise: float
     theta: Float[Tensor, "B 2"]
     information: Float[Tensor, "B 2 2"]
     estimates: dict[str, Float[Tensor, "T B 2"]]
@@ -112,7 +110,7 @@ def roll_out(
     lower, upper = config.prior.corners(B)
     information = torch.diag_embed(1 / ((upper - lower) / 12**0.5) ** 2)
     others = {name: torch.stack(of) for name, of in estimates.items()}
-    return Rollouts(steps, truth, noise, (lower + upper) / 2, information, others, float(torch.stack(contained).mean()))
+    return Rollouts(steps, truth, (lower + upper) / 2, information, others, float(torch.stack(contained).mean()))
 
 
 def _hybrid(config: LearnedObserverConfig, sets: SetMembershipObserver, noise: float) -> HybridObserver:

@@ -62,10 +62,5 @@ def _replay(path: Path) -> dict[str, Any]:
 
 
 def _points(*points: Any) -> None:
-    """Check that these are pairs of numbers.
-
-    Raises:
-        ValueError: one is not a pair.
-        TypeError: one does not hold numbers.
-    """
+    """Check that these are pairs of numbers, by a ValueError or TypeError."""
     np.array(points, dtype=float).reshape(len(points), 2)
