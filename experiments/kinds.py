@@ -27,12 +27,7 @@ Track = Callable[..., Iterable[Any]]
 
 @dataclass(frozen=True)
 class Later:
-    """A function of `experiments` that is imported when it is called.
-
-    Attributes:
-        module: its module.
-        name: its name.
-    """
+    """A function of `experiments` that is imported when it is called."""
 
     module: str
     name: str

@@ -10,7 +10,7 @@ import csv
 import io
 import json
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn, Self
@@ -206,16 +206,6 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_text(encoding="utf-8"))
 
 
-def read_lines(path: Path) -> list[Any]:
-    """The content of a file of JSON lines.
-
-    Raises:
-        FigureError: the file is missing or damaged.
-    """
-    with reading(path), path.open(encoding="utf-8") as file:
-        return [json.loads(line) for line in file]
-
-
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
     """In this block write the yielded file. At its end the file becomes `path`. After an error `path` is as it was."""
@@ -255,6 +245,11 @@ class Appender:
         except BaseException:
             self.file.truncate(whole)
             raise
+
+
+def rows_of(columns: Mapping[str, Iterable[Any]]) -> list[dict[str, Any]]:
+    """The table rows of columns of the same length."""
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 class RowWriter(Appender):

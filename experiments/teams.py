@@ -9,15 +9,13 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from torchfsid.config.documents import Strict, wrong
-from torchfsid.config.quantities import NonNegative, Positive
+from experiments.runs.config import Count, WholeNumber
+from torchfsid.config.documents import Strict
+from torchfsid.config.quantities import NonNegative, Positive, require_interval
 from torchfsid.errors import ConfigError
 
 TRIES = 1000
 """Places tried for a body before there is no room for it."""
-
-Robots = Annotated[int, Field(strict=True, ge=1)]
-Obstacles = Annotated[int, Field(strict=True, ge=0)]
 
 
 class TeamConfig(Strict):
@@ -32,17 +30,16 @@ class TeamConfig(Strict):
         separation: least distance between starts and obstacles, and between goals and obstacles [m].
     """
 
-    robots: Annotated[tuple[Robots, ...], Field(min_length=2, max_length=2)]
-    obstacles: Annotated[tuple[Obstacles, ...], Field(min_length=2, max_length=2)] = (0, 0)
+    robots: Annotated[tuple[Count, ...], Field(min_length=2, max_length=2)]
+    obstacles: Annotated[tuple[WholeNumber, ...], Field(min_length=2, max_length=2)] = (0, 0)
     place: Annotated[tuple[Literal["circle", "disc"], ...], Field(min_length=1)]
     radius: Positive
     separation: NonNegative
 
     @model_validator(mode="after")
     def _are_ranges(self) -> TeamConfig:
-        for name, (least, greatest) in (("robots", self.robots), ("obstacles", self.obstacles)):
-            if least > greatest:
-                raise wrong(f"expected the smaller number first, got {[least, greatest]}", name)
+        require_interval("robots", self.robots)
+        require_interval("obstacles", self.obstacles)
         return self
 
     def draw(self, random: np.random.Generator) -> dict[str, list[dict[str, Any]]]:

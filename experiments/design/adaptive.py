@@ -28,6 +28,7 @@ from torch import Tensor, nn
 
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.identification.kkt import CASES
+from torchfsid.programmes.differentiable import times
 from torchfsid.programmes.layers import ProjectOnto
 
 UNTRAINED = (0.0, 7.0, -3.0)
@@ -175,18 +176,14 @@ class AdaptiveObserver(nn.Module):
         estimates = []
         for step in steps:
             Gamma, information, pull = self.gain(step, information)
-            innovation = step.u - _times(step.G, theta) - step.f
-            theta = theta + _times(Gamma, _times(step.G.mT, innovation))
+            innovation = step.u - times(step.G, theta) - step.f
+            theta = theta + times(Gamma, times(step.G.mT, innovation))
             if self.project is not None:
                 theta = self.project(step.theta_set, theta).point
             if pull is not None:
                 theta = theta + pull.unsqueeze(-1) * (step.centroid - theta)
             estimates.append(theta)
         return torch.stack(estimates)
-
-
-def _times(M: Float[Tensor, "B 2 2"], v: Float[Tensor, "B 2"]) -> Float[Tensor, "B 2"]:
-    return (M @ v.unsqueeze(-1)).squeeze(-1)
 
 
 def _inverse(M: Float[Tensor, "B 2 2"]) -> Float[Tensor, "B 2 2"]:

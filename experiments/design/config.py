@@ -9,30 +9,21 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from experiments.runs.config import Text, WholeNumber
+from experiments.runs.config import Count, Text, WholeNumber, require_steps
 from experiments.teams import TeamConfig
 from torchfsid.config.barriers import AvoidanceConfig
 from torchfsid.config.documents import Strict, wrong
-from torchfsid.config.observers import UkfConfig
+from torchfsid.config.observers import PriorConfig, UkfConfig
 from torchfsid.config.quantities import NonNegative, Number, PlanarVector, Positive, known
 
-Count = Annotated[int, Field(strict=True, ge=1)]
 Several = Annotated[int, Field(strict=True, ge=2)]
-MAX_STEPS = 100_000
-"""More is a slip of the pen in dt or duration."""
 
 
-class BoxConfig(Strict):
+class BoxConfig(PriorConfig):
     """A rectangle [m]."""
 
     lower: PlanarVector
     upper: PlanarVector
-
-    @model_validator(mode="after")
-    def _is_a_box(self) -> BoxConfig:
-        if not all(low < high for low, high in zip(self.lower, self.upper, strict=True)):
-            raise wrong(f"expected lower < upper, got {list(self.lower)} and {list(self.upper)}")
-        return self
 
 
 class DesignConfig(Strict):
@@ -72,8 +63,7 @@ class DesignConfig(Strict):
 
     @model_validator(mode="after")
     def _can_be_run(self) -> DesignConfig:
-        if not 1 <= self.duration / self.dt <= MAX_STEPS:
-            raise wrong(f"expected 1 to {MAX_STEPS} steps of dt = {self.dt} s, got {self.duration} s", "duration")
+        require_steps(self.duration, self.dt)
         if self.avoidance.margin is not None or self.avoidance.safety_distances:
             raise wrong("bodies have no names and no radius here: give one safety_distance", "avoidance")
         if self.avoidance.is_unknown:
@@ -83,16 +73,16 @@ class DesignConfig(Strict):
         return self
 
 
-class GoalsConfig(Strict):
-    """Numbers of random goals.
+class NumbersConfig(Strict):
+    """How many random goals or teams there are.
 
     Attributes:
-        train: goals to search with.
-        validation: goals to choose among finalists.
-        test: goals to report on.
+        train: those to search with, or to train on.
+        validation: those to choose among finalists, or to stop the training and to tune by hand.
+        test: those to report on.
     """
 
-    train: Several
+    train: Count
     validation: Count
     test: Count
 
@@ -165,7 +155,7 @@ class ProbePlacementConfig(DesignConfig):
     set: Literal["critical_region", "inverse_optimal"]
     active_tolerance: Positive = 1e-3
     velocity_noise: NonNegative = 1e-2
-    goals: GoalsConfig
+    goals: NumbersConfig
     search: SearchConfig
     landscape: tuple[Several, Several]
     gradient_check: GradientCheckConfig
@@ -178,23 +168,11 @@ class ProbePlacementConfig(DesignConfig):
             raise wrong("expected 1 among them: the landscape is that of a probe that stands still", "way_points")
         if self.search.finalists > self.search.starts * self.search.steps:
             raise wrong("more than there are placements", "search.finalists")
+        if self.goals.train < 2:
+            raise wrong("expected several, whose mean is taken", "goals.train")
         if max(self.gradient_check.horizons) > self.steps:
             raise wrong(f"a run has {self.steps} samples", "gradient_check.horizons")
         return self
-
-
-class TeamsConfig(Strict):
-    """Numbers of random teams.
-
-    Attributes:
-        train: teams to train on.
-        validation: teams to stop the training and to tune by hand.
-        test: teams to compare on.
-    """
-
-    train: Count
-    validation: Count
-    test: Count
 
 
 class TrainingConfig(Strict):
@@ -229,7 +207,7 @@ class LearnedObserverConfig(DesignConfig):
 
     kind: Literal["learned_observer"]
     team: TeamConfig
-    teams: TeamsConfig
+    teams: NumbersConfig
     noise: Annotated[tuple[Positive, ...], Field(min_length=1)]
     unseen_noise: Annotated[tuple[Positive, ...], Field(min_length=1)]
     gains: Annotated[tuple[Positive, ...], Field(min_length=1)]

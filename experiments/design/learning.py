@@ -22,7 +22,7 @@ from experiments.design.adaptive import AdaptiveObserver, ConstantGain, NetworkG
 from experiments.design.config import LearnedObserverConfig
 from experiments.design.rollouts import Rollouts, roll_out
 from experiments.kinds import Track
-from experiments.results import RowWriter, write_rows
+from experiments.results import RowWriter, rows_of, write_rows
 from experiments.tables import print_rows
 from torchfsid.commands.results_folder import write_json
 from torchfsid.identification.kkt import CASES
@@ -151,11 +151,8 @@ def _error(observer: nn.Module, levels: Sequence[Rollouts]) -> Float[Tensor, ""]
 def _rows(name: str, noise: float, error: Float[Tensor, "T B"], config: LearnedObserverConfig) -> list[dict[str, Any]]:
     of_teams = error.reshape(len(error), config.teams.test, -1).mean(-1)
     at = {f"at {t} s": of_teams[min(round(t / config.dt), len(error) - 1)].tolist() for t in config.times}
-    columns = {"mean": of_teams.mean(0).tolist(), **at}
-    return [
-        {"observer": name, "noise": noise, "team": team, **{key: of[team] for key, of in columns.items()}}
-        for team in range(config.teams.test)
-    ]
+    columns = {"team": range(config.teams.test), "mean": of_teams.mean(0).tolist(), **at}
+    return [{"observer": name, "noise": noise, **row} for row in rows_of(columns)]
 
 
 def _answers(network: NetworkGain, config: LearnedObserverConfig) -> list[dict[str, Any]]:
@@ -166,9 +163,8 @@ def _answers(network: NetworkGain, config: LearnedObserverConfig) -> list[dict[s
         for case, letter in enumerate(CASES):
             with torch.no_grad():
                 answer = network.answer(areas, torch.full((len(areas),), case), noise)
-            for area, *values in zip(areas.tolist(), *(of.tolist() for of in answer), strict=True):
-                said = dict(zip(answer._fields, values, strict=True))
-                rows.append({"noise": noise, "case": letter, "area": area, **said})
+            said = {name: of.tolist() for name, of in answer._asdict().items()}
+            rows += [{"noise": noise, "case": letter, **row} for row in rows_of({"area": areas.tolist(), **said})]
     return rows
 
 

@@ -35,7 +35,9 @@ def place(config: ProbePlacementConfig, out: Path, track: Track) -> dict[str, An
     checking, *seeds, drawing = np.random.SeedSequence(config.seed).spawn(2 + config.scenes)
     corridors = [_Corridor(config, seed) for seed in seeds]
     rows: list[dict[str, Any]] = []
-    jobs = [(i, K, method) for i in range(len(corridors)) for K in config.way_points for method in _methods(K)]
+    # A grid is for one way-point only: its size grows with the power 2 K.
+    methods = {K: [name for name in METHODS if name != "grid" or K == 1] for K in config.way_points}
+    jobs = [(i, K, method) for i in range(len(corridors)) for K in config.way_points for method in methods[K]]
     with RowWriter(out / "runs.csv") as runs:
         for i, K, method in track(jobs, "Searching", len(jobs)):
             new = [{"corridor": i, "way_points": K, **row} for row in corridors[i].compare(K, method)]
@@ -58,11 +60,6 @@ def place(config: ProbePlacementConfig, out: Path, track: Track) -> dict[str, An
     return summary | {"no gradient": nothing, "where active sets switch": summarise_switches(switches)}
 
 
-def _methods(way_points: int) -> list[str]:
-    """The methods for K way-points. A grid is for K = 1 only: its size grows with the power 2 K."""
-    return [*(["grid"] if way_points == 1 else []), *METHODS]
-
-
 class _Corridor:
     """One corridor, its goals, and the placements chosen for it."""
 
@@ -82,7 +79,7 @@ class _Corridor:
         # Every method has the same random numbers: the same starts, the same random places.
         seed = np.random.SeedSequence(self._searching.entropy, spawn_key=(*self._searching.spawn_key, K))
         search = Search.of(self.probing, self.train, K, seed)
-        found = self._on_grid(search) if method == "grid" else METHODS[method](search)
+        found = METHODS[method](search)
         chosen = choose(search, found, self.validation)
         seconds = time.perf_counter() - started
         self.chosen.setdefault(K, {})[method] = chosen
@@ -108,20 +105,9 @@ class _Corridor:
             "seconds": seconds,
         }
 
-    def _on_grid(self, search: Search) -> Evaluated:
-        """Evaluate as many places as the other methods, on a grid."""
-        found, settings = Evaluated(), self.config.search
-        lower, upper = self.probing.room
-        width, height = (upper - lower).tolist()
-        columns = max(1, round((settings.starts * settings.steps * width / height) ** 0.5))
-        places = _grid(self.probing, columns, settings.starts * settings.steps // columns)
-        for chunk in self.probing.allowed(places.unsqueeze(1)).split(settings.starts):
-            found.add(chunk, search.evaluate(chunk))
-        return found
-
     def landscape(self, track: Track) -> list[dict[str, Any]]:
         """Mean areas of a still probe on the grid. Places that are not allowed have no area."""
-        places = _grid(self.probing, *self.config.landscape)
+        places = self.probing.grid(*self.config.landscape)
         allowed = (places - self.probing.start).norm(dim=-1) >= self.config.safety_distance
         means = torch.full((len(places),), torch.nan, dtype=torch.float64)
         chunks = allowed.nonzero().flatten().split(self.config.search.starts)
@@ -169,13 +155,6 @@ class _Corridor:
                     }
                 )
         return {"way_point_places": None if placement is None else placement[0].tolist(), "samples": samples}
-
-
-def _grid(probing: Probing, columns: int, rows: int) -> Tensor:
-    """Centres of the cells of a grid over the room, row by row."""
-    lower, upper = probing.room
-    x, y = ((torch.arange(count, dtype=torch.float64) + 0.5) / count for count in (columns, rows))
-    return lower + (upper - lower) * torch.cartesian_prod(y, x).flip(-1)
 
 
 def _descent(found: Evaluated) -> list[dict[str, Any]]:

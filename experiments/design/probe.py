@@ -92,12 +92,12 @@ class Probing:
     @property
     def prior(self) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
         """Lower and upper corner of Theta_0 [m]."""
-        return _box(self.config.prior)
+        return _corners(self.config.prior)
 
     @property
     def room(self) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
         """Lower and upper corner of the room for way-points [m]."""
-        return _box(self.config.room)
+        return _corners(self.config.room)
 
     @property
     def prior_area(self) -> float:
@@ -109,6 +109,12 @@ class Probing:
         """Goals evenly spread over Theta_0 (scrambled Sobol points) [m]."""
         lower, upper = self.prior
         return lower + (upper - lower) * torch.quasirandom.SobolEngine(2, True, seed).draw(count, dtype=torch.float64)
+
+    def grid(self, columns: int, rows: int) -> Float[Tensor, "places 2"]:
+        """Centres of the cells of a grid over the room, row by row [m]."""
+        lower, upper = self.room
+        x, y = ((torch.arange(count, dtype=torch.float64) + 0.5) / count for count in (columns, rows))
+        return lower + (upper - lower) * torch.cartesian_prod(y, x).flip(-1)
 
     def allowed(self, placements: Float[Tensor, "P K 2"]) -> Float[Tensor, "P K 2"]:
         """The nearest allowed placements [m].
@@ -136,17 +142,9 @@ class Probing:
         noise = NoiseBound(config.velocity_noise) if config.set == "inverse_optimal" else None
         return ObservationModel(controller.task, controller.barriers, config.set, noise, config.active_tolerance)
 
-    def loop(
-        self, placements: Float[Tensor, "P K 2"] | None, goals: Float[Tensor, "S 2"], steps: int | None = None
-    ) -> Iterator[Sample]:
-        """The robot in closed loop, with every placement and every goal: P x S items.
-
-        Args:
-            placements: way-points [m], or None for no probe (S items).
-            goals: goals [m].
-            steps: number of samples. Default: the whole run.
-        """
-        bodies = self._bodies(placements, steps or self.config.steps).repeat_interleave(len(goals), dim=1)
+    def loop(self, placements: Float[Tensor, "P K 2"] | None, goals: Float[Tensor, "S 2"]) -> Iterator[Sample]:
+        """The robot in closed loop, with every placement [m] (None: no probe) and every goal [m]: P x S items."""
+        bodies = self._bodies(placements, self.config.steps).repeat_interleave(len(goals), dim=1)
         (T, B), dt, present = bodies.shape[:2], self.config.dt, torch.ones(bodies.shape[1:3], dtype=torch.bool)
 
         def around(t: float, x: Tensor, _: Tensor) -> Measurement:
@@ -175,8 +173,7 @@ class Probing:
 
     def prior_of(self, items: int) -> FeasibleSet:
         """Theta_0, once for each item."""
-        lower, upper = self.prior
-        return FeasibleSet.from_box(lower.expand(items, 2), upper.expand(items, 2))
+        return self.config.prior.build(items)
 
     def left(
         self, placements: Float[Tensor, "P K 2"] | None, goals: Float[Tensor, "S 2"], steps: int | None = None
@@ -253,5 +250,6 @@ def _by_item(rows: Halfspaces, used: Bool[Tensor, "T B"]) -> Halfspaces:
     return Halfspaces(A.flatten(1, 2), b.flatten(1, 2))
 
 
-def _box(box: BoxConfig) -> tuple[Tensor, Tensor]:
-    return torch.tensor(box.lower, dtype=torch.float64), torch.tensor(box.upper, dtype=torch.float64)
+def _corners(box: BoxConfig) -> tuple[Tensor, Tensor]:
+    (lower,), (upper,) = box.corners(1)
+    return lower, upper

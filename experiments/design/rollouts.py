@@ -24,7 +24,6 @@ from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.simulation import closed_loop
 from torchfsid.robots.tasks import GoalTask
-from torchfsid.sets.feasible_set import FeasibleSet
 
 
 @dataclass(frozen=True)
@@ -34,7 +33,6 @@ class Rollouts:
     Attributes:
         steps: the input of an adaptive observer, sample by sample.
         goals: the true goals [m].
-        noise: bound of the disturbance [m/s].
         theta: centre of the prior [m].
         information: information matrix of the prior.
         estimates: estimates (T, B, 2) by observer [m]: `centroid`, and with filters `ukf` and `hybrid`.
@@ -43,7 +41,6 @@ class Rollouts:
 
     steps: list[Step]
     goals: Float[Tensor, "B 2"]
-    noise: float
     theta: Float[Tensor, "B 2"]
     information: Float[Tensor, "B 2 2"]
     estimates: dict[str, Float[Tensor, "T B 2"]]
@@ -83,23 +80,13 @@ def roll_out(
         team = x.reshape(-1, 1, N, 2).expand(-1, N, -1, -1)
         return Measurement(t=t, x=x, u=None, bodies=torch.cat([team, obstacles], dim=2).flatten(0, 1), present=present)
 
-    task, barriers = GoalTask(config.gain), [config.avoidance.build([])]
-    truth, start = goals.flatten(0, 1), starts.flatten(0, 1)
-    loop = closed_loop(
-        CbfQpController(task, barriers),
-        truth,
-        start,
-        around,
-        dt=config.dt,
-        samples=config.steps,
-        disturbance=disturbance,
-    )
-    lower, upper = (torch.tensor(bound, dtype=torch.float64) for bound in (config.prior.lower, config.prior.upper))
-    prior = FeasibleSet.from_box(lower.expand(B, 2), upper.expand(B, 2))
+    controller = CbfQpController(GoalTask(config.gain), [config.avoidance.build([])])
+    truth, start, settings = goals.flatten(0, 1), starts.flatten(0, 1), {"dt": config.dt, "samples": config.steps}
+    loop = closed_loop(controller, truth, start, around, disturbance=disturbance, **settings)
+    prior, tolerance = config.prior.build(B), config.active_tolerance + noise
     sets = SetMembershipObserver(
-        task, barriers, prior, noise=NoiseBound(noise), active_tolerance=config.active_tolerance + noise
+        controller.task, controller.barriers, prior, noise=NoiseBound(noise), active_tolerance=tolerance
     )
-    spread = (upper - lower) / 12**0.5
     hybrid = _hybrid(config, sets, noise) if filters else None
     steps, estimates, contained = [], {"centroid": [], **({"ukf": [], "hybrid": []} if filters else {})}, []
     with torch.no_grad():
@@ -120,25 +107,18 @@ def roll_out(
             steps.append(Step(facets, area, centroid, kkt.case, G, kkt.f, u, noise))
             estimates["centroid"].append(centroid)
             contained.append(theta_set.contains(truth).double().mean())
-    return Rollouts(
-        steps,
-        truth,
-        noise,
-        ((lower + upper) / 2).expand(B, 2),
-        torch.diag_embed(1 / spread**2).expand(B, 2, 2),
-        {name: torch.stack(of) for name, of in estimates.items()},
-        float(torch.stack(contained).mean()),
-    )
+    lower, upper = config.prior.corners(B)
+    information = torch.diag_embed(1 / ((upper - lower) / 12**0.5) ** 2)
+    others = {name: torch.stack(of) for name, of in estimates.items()}
+    return Rollouts(steps, truth, (lower + upper) / 2, information, others, float(torch.stack(contained).mean()))
 
 
 def _hybrid(config: LearnedObserverConfig, sets: SetMembershipObserver, noise: float) -> HybridObserver:
     """The hybrid observer. Its filter knows the disturbance: `noise`/2 along an axis, independent at every sample."""
-    prior = sets.feasible_set.body.vertices
     ukf = ParameterUkf.from_prior(
         sets.task,
         sets.barriers,
-        prior.amin(1),
-        prior.amax(1),
+        *config.prior.corners(len(sets.status)),
         position_noise=config.ukf.position_noise,
         process_noise=config.ukf.process_noise,
         motion_noise=noise / 2 * config.dt**0.5,

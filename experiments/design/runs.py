@@ -20,6 +20,7 @@ from torch.autograd.function import once_differentiable
 from experiments.design.config import DesignConfig
 from torchfsid.halfspaces import array, dot
 from torchfsid.kernels.runs import run_to_goals
+from torchfsid.programmes.differentiable import times
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement
 from torchfsid.sets.derivatives import solution
@@ -104,7 +105,7 @@ def _jacobians(
     with torch.enable_grad():
         seen = Measurement(t=0.0, x=x, u=None, bodies=near, present=filled)
         (safe_controls,), (C, d) = (barrier(seen) for barrier in controller.barriers), controller.task(seen)
-        uhat = (C @ theta.unsqueeze(-1)).squeeze(-1) + d
+        uhat = times(C, theta) + d
         # Two equations M u = right: an active row each, or no motion across them.
         first, second = safe_controls.A.unbind(1)
         along = torch.stack([-first[:, 1], first[:, 0]], dim=-1)

@@ -5,6 +5,7 @@ the smallest mean areas, are compared on the validation goals. The best of them 
 that no method has seen.
 
     one_random    a place drawn from the room; nothing is compared
+    grid          the best of as many places on a grid over the room, for a probe that stands still
     random        the best of as many places drawn from the room
     near_path     the best of as many places drawn near the path predicted without a probe
     cem           the cross-entropy method: generations from a Gaussian fitted to the best of the generation before
@@ -75,8 +76,9 @@ class Search:
 
     @classmethod
     def of(cls, probing: Probing, goals: Float[Tensor, "S 2"], way_points: int, seed: np.random.SeedSequence) -> Search:
-        """A search with the predicted path for these goals, and random numbers from `seed`."""
-        return cls(probing, goals, predicted_path(probing, goals), way_points, np.random.default_rng(seed))
+        """A search with random numbers from `seed`. The predicted path is the mean over goals, without a probe."""
+        path = probing.run(None, goals).x.mean(1)
+        return cls(probing, goals, path, way_points, np.random.default_rng(seed))
 
     def anywhere(self, count: int) -> Float[Tensor, "P K 2"]:
         """Way-points drawn uniformly from the room [m]."""
@@ -95,9 +97,8 @@ class Search:
         spread = config.search.spread
         if K == 1:
             at = torch.from_numpy(self.random.integers(T, size=(count, 1)))
-            return self.probing.allowed(
-                self.path[at] + spread * torch.from_numpy(self.random.normal(size=(count, 1, 2)))
-            )
+            away = spread * torch.from_numpy(self.random.normal(size=(count, 1, 2)))
+            return self.probing.allowed(self.path[at] + away)
         at = torch.linspace(0, T - 1, K).round().long()
         turns = self.random.normal(size=(count, K)) * TURN
         turns[:, 0] = self.random.uniform(0, 2 * np.pi, size=count)
@@ -112,11 +113,6 @@ class Search:
             return self.probing.left(placements, self.goals).area
 
 
-def predicted_path(probing: Probing, goals: Float[Tensor, "S 2"]) -> Float[Tensor, "T 2"]:
-    """The mean path of the robot over its possible goals, without a probe [m]."""
-    return probing.run(None, goals).x.mean(1)
-
-
 def drawn(draw: Callable[[Search, int], Tensor]) -> Callable[[Search], Evaluated]:
     """The method that evaluates placements drawn by `draw`, all in all `starts` x `steps`."""
 
@@ -128,6 +124,18 @@ def drawn(draw: Callable[[Search, int], Tensor]) -> Callable[[Search], Evaluated
         return found
 
     return method
+
+
+def grid(search: Search) -> Evaluated:
+    """The method that evaluates places on a grid of about square cells."""
+    found, settings = Evaluated(), search.probing.config.search
+    lower, upper = search.probing.room
+    width, height = (upper - lower).tolist()
+    columns = max(1, round((settings.starts * settings.steps * width / height) ** 0.5))
+    places = search.probing.grid(columns, settings.starts * settings.steps // columns)
+    for chunk in search.probing.allowed(places.unsqueeze(1)).split(settings.starts):
+        found.add(chunk, search.evaluate(chunk))
+    return found
 
 
 def cem(search: Search) -> Evaluated:
@@ -198,6 +206,7 @@ def _descend(
 
 
 METHODS: dict[str, Callable[[Search], Evaluated]] = {
+    "grid": grid,
     "random": drawn(Search.anywhere),
     "near_path": drawn(Search.near_path),
     "cem": cem,

@@ -18,10 +18,6 @@ from torchfsid.commands.results_folder import named
 def draw(folder: Path, config: Any) -> list[Path]:
     """Draw all figures of the configuration's kind, each figure as PNG and PDF, each film as GIF.
 
-    Args:
-        folder: the results folder.
-        config: its configuration.
-
     Raises:
         FigureError: a needed file is missing or damaged.
         OSError: a figure cannot be written.

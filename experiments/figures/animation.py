@@ -14,19 +14,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from experiments.figures.drawing import (
-    add_goal,
-    add_obstacles,
-    add_region,
-    add_robot,
-    darken,
-    disc_radius,
-    frame,
-    map_frame,
-    padded,
-)
+from experiments.figures import drawing
 from experiments.figures.film import Film, spread
-from experiments.figures.style import HYBRID, ROBOT, SET_COLOURS, TEAM, UKF, length
+from experiments.figures.style import HYBRID, ROBOT, SET_COLOURS, UKF, length, team_colours
 from experiments.runs.config import SceneConfig
 from experiments.runs.lengths import lengths
 from experiments.runs.saved import Results
@@ -64,26 +54,25 @@ def animate(results: Results, config: SceneConfig) -> Film:
 
 def _colours(config: SceneConfig) -> list[str]:
     """The colours of the regions: one fixed colour for a single robot, the robots' colours for a team."""
-    count = len(config.robots)
-    return [SET_COLOURS[config.set]] if count == 1 else [TEAM[i % len(TEAM)] for i in range(count)]
+    return [SET_COLOURS[config.set]] if len(config.robots) == 1 else team_colours(config)
 
 
 def _map(axes: Axes, results: Results, config: SceneConfig) -> Redraw:
-    alone, colours = len(config.robots) == 1, _colours(config)
-    discs = add_obstacles(axes, config)
+    alone, colours, radius = len(config.robots) == 1, _colours(config), drawing.disc_radius(config)
+    discs = drawing.add_obstacles(axes, config, [])
     names = list(axes.texts)
     regions, paths, robots, filters, hybrids = [], [], [], [], []
     for robot, colour, goal in zip(config.robots, colours, results.goals, strict=True):
         body = ROBOT if alone else colour
-        regions.append(add_region(axes, results.regions[0][0].vertices[config.set], colour, filled=True))
+        regions.append(drawing.add_region(axes, results.regions[0][0].vertices[config.set], colour, filled=True))
         paths += axes.plot([], [], color=body, lw=1.1)
-        robots.append(add_robot(axes, results.paths[robot.name][0], disc_radius(config), body, solid=alone))
+        robots.append(drawing.add_robot(axes, results.paths[robot.name][0], radius, body, solid=alone))
         filters += axes.plot([], [], "x", color=UKF if alone else colour, ms=6, mew=1.6)
         hybrids += axes.plot([], [], "D", color=HYBRID if alone else colour, ms=6.5, mfc="none", mew=1.2)
-        add_goal(axes, goal, "black" if alone else colour, size=10)
+        drawing.add_goal(axes, goal, "black" if alone else colour, size=10)
     goals = [line for line in axes.lines if line.get_marker() == "*"]
     clock = axes.text(0.02, 0.98, "", transform=axes.transAxes, va="top", fontweight="bold")
-    frame(axes, map_frame(results, config, aspect=1.1))
+    drawing.frame(axes, drawing.map_frame(results, config, aspect=1.1))
     axes.set(xlabel="x [m]", ylabel="y [m]", title=config.title)
     moving = [*regions, *discs, *names, *paths, *robots, *goals, *filters, *hybrids, clock]
     for artist in moving:
@@ -91,7 +80,7 @@ def _map(axes: Axes, results: Results, config: SceneConfig) -> Redraw:
     ukf, hybrid = results.numbers("ukf_0", "ukf_1"), results.numbers("hybrid_0", "hybrid_1")
 
     def update(k: int) -> Iterable[Artist]:
-        darken(axes, discs, config, [name for of_robot in results.regions[k] for name in of_robot.active])
+        drawing.darken(axes, discs, config, [name for of_robot in results.regions[k] for name in of_robot.active])
         for i, robot in enumerate(config.robots):
             path = results.paths[robot.name]
             regions[i].set_xy(results.regions[k][i].vertices[config.set])
@@ -107,9 +96,9 @@ def _map(axes: Axes, results: Results, config: SceneConfig) -> Redraw:
 
 def _regions(axes: Axes, results: Results, config: SceneConfig) -> Redraw:
     """Every region about its goal, all to the scale of the largest."""
-    regions = [add_region(axes, np.zeros((3, 2)), colour, filled=True) for colour in _colours(config)]
+    regions = [drawing.add_region(axes, np.zeros((3, 2)), colour, filled=True) for colour in _colours(config)]
     scale = axes.text(0.99, 0.98, "", transform=axes.transAxes, ha="right", va="top")
-    add_goal(axes, (0.0, 0.0), size=10)
+    drawing.add_goal(axes, (0.0, 0.0), size=10)
     axes.set(xticks=[], yticks=[], aspect="equal", adjustable="datalim", title="the whole region, about the goal")
     axes.spines[["top", "right"]].set_visible(True)
     star = axes.lines[0]
@@ -123,7 +112,7 @@ def _regions(axes: Axes, results: Results, config: SceneConfig) -> Redraw:
             region.set_xy(vertices)
         vertices = np.vstack([*about, np.zeros((1, 2))])
         width, height = axes.bbox.size
-        (left, bottom), (right, top) = padded(vertices.min(0), vertices.max(0), width / height, 1.2)
+        (left, bottom), (right, top) = drawing.padded(vertices.min(0), vertices.max(0), width / height, 1.2)
         axes.set(xlim=(left, right), ylim=(bottom, top))
         scale.set_text(f"width of this panel: {length(right - left)}")
         return moving
@@ -142,8 +131,7 @@ def _curves(axes: Axes, results: Results) -> Redraw:
     ]
     lines, curves = [], []
     for name, label, colour, width, dashes in shown:
-        positive = np.where(measures[name] > 0, measures[name], np.nan)
-        curve = np.exp(np.log(positive).mean(axis=1))
+        curve = np.exp(np.log(drawing.positive(measures[name])).mean(axis=1))
         axes.semilogy(results.t, curve, color=colour, lw=width, alpha=0.2)
         curves.append(curve)
         lines += axes.plot([], [], color=colour, lw=width, ls=dashes, label=label, animated=True)

@@ -10,11 +10,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, Polygon, Rectangle
+from matplotlib.patches import Patch, Polygon
 
-from experiments.figures.drawing import add_goal, add_region
-from experiments.figures.style import ACTIVE, CURVES, INVERSE_OPTIMAL, REGION, ROBOT, SET_COLOURS, UKF
-from experiments.results import read_json, reading
+from experiments.figures.drawing import add_box, add_curves, add_goal, add_region, frame, headline, marker
+from experiments.figures.style import ACTIVE, INVERSE_OPTIMAL, REGION, ROBOT, SET_COLOURS, UKF
+from experiments.results import reading
 from experiments.runs.config import CasesConfig
 from experiments.runs.lengths import lengths
 from experiments.runs.saved import Region, Results
@@ -33,7 +33,8 @@ def draw_cases(folder: Path, config: CasesConfig) -> Iterator[tuple[str, Figure]
     for i, case in enumerate(config.cases):
         _draw_rows(axes[0, i], results.regions[half_way][i], reach)
         _draw_sets(axes[1, i], results, i)
-        _draw_lengths(axes[2, i], results.t, {name: values[:, i] for name, values in measures.items()})
+        add_curves(axes[2, i], results.t, {name: values[:, i] for name, values in measures.items()})
+        axes[2, i].set_xlabel("t [s]")
         axes[0, i].set_title(case.name, fontweight="bold", loc="center")
         _set_verdict(axes[1, i], measured[i])
         axes[2, i].sharey(axes[2, 0])
@@ -42,19 +43,15 @@ def draw_cases(folder: Path, config: CasesConfig) -> Iterator[tuple[str, Figure]
     axes[0, 0].set_ylabel("$u_y$ [m/s]")
     axes[1, 0].set_ylabel("goal y [m]")
     axes[2, 0].set_ylabel("[m]")
-    figure.suptitle(
-        f"{config.title}: can a point estimator learn, does the paper's region shrink? (In brackets: the paper)",
-        fontsize=9,
-        x=0.01,
-        ha="left",
-    )
+    question = "can a point estimator learn, does the paper's region shrink? (In brackets: the paper)"
+    headline(figure, f"{config.title}: {question}")
     handles = [
         Line2D([], [], color=ACTIVE, lw=1.8),
         Line2D([], [], color="0.65", lw=0.9),
-        Line2D([], [], color="black", ls="", marker="o", mfc="white", ms=8),
-        Line2D([], [], color=ROBOT, ls="", marker="o", ms=5.5),
-        Line2D([], [], color="black", ls="", marker="*", ms=9),
-        Line2D([], [], color=UKF, ls="", marker="x", ms=6, mew=1.6),
+        marker("o", "black", mfc="white", ms=8),
+        marker("o", ROBOT, ms=5.5),
+        marker("*", "black", ms=9),
+        marker("x", UKF, ms=6, mew=1.6),
         Patch(facecolor="#BFE7DC", edgecolor=REGION),
         Patch(facecolor="none", edgecolor=INVERSE_OPTIMAL),
     ]
@@ -67,9 +64,8 @@ def draw_cases(folder: Path, config: CasesConfig) -> Iterator[tuple[str, Figure]
 
 def _measured(results: Results) -> list[dict[str, Any]]:
     """The entries of summary.json for each case that are shown."""
-    path = results.folder / "summary.json"
-    with reading(path):
-        of_cases = read_json(path)["cases"]
+    with reading(results.folder / "summary.json"):
+        of_cases = results.summary["cases"]
         shown = [f"{what}_{by}" for what in ("point", "region") for by in ("measured", "paper")]
         return [{name: str(of_cases[i][name]) for name in shown} for i in range(len(results.robots))]
 
@@ -103,23 +99,14 @@ def _draw_rows(axes: Axes, region: Region, reach: float) -> None:
 
 def _draw_sets(axes: Axes, results: Results, i: int) -> None:
     """The plane of goals: the final sets within the prior."""
-    (left, bottom), (right, top) = np.array(results.config.prior.lower), np.array(results.config.prior.upper)
-    axes.add_patch(Rectangle((left, bottom), right - left, top - bottom, fill=False, ec="0.6", lw=0.8))
+    lower, upper = np.array(results.config.prior.lower), np.array(results.config.prior.upper)
+    add_box(axes, (lower, upper), ec="0.6", lw=0.8)
     for kind, filled in (("critical_region", True), ("inverse_optimal", False)):
         add_region(axes, results.regions[-1][i].vertices[kind], SET_COLOURS[kind], filled=filled)
     path = results.numbers("ukf_0", "ukf_1")[:, i]
     axes.plot(*path.T, color=UKF, lw=1.0, zorder=6)
     axes.plot(*path[-1], "x", color=UKF, ms=6, mew=1.6, zorder=8)
     add_goal(axes, results.goals[i])
-    margin = 0.06 * (right - left)
-    axes.set(
-        xlim=(left - margin, right + margin), ylim=(bottom - margin, top + margin), aspect="equal", xlabel="goal x [m]"
-    )
-
-
-def _draw_lengths(axes: Axes, t: np.ndarray, measures: dict[str, np.ndarray]) -> None:
-    for curve in CURVES:
-        values = measures[curve.measure]
-        axes.semilogy(t, np.where(values > 0, values, np.nan), label=curve.label, **curve.looks)
-    axes.grid(True)
-    axes.set(xlabel="t [s]", xlim=(t[0], t[-1]))
+    margin = 0.06 * (upper - lower)[0]
+    frame(axes, (lower - margin, upper + margin))
+    axes.set_xlabel("goal x [m]")

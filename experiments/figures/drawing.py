@@ -1,18 +1,22 @@
-"""Common parts of the figures of scenes: the map with its bodies, regions, and the frame of a map.
+"""Common parts of the figures: headings, curves, entries of legends, and the map with its bodies and regions.
 
 A body, the robot included, is a disc of radius Ds/2. Two discs that touch are at the safety distance.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from string import ascii_lowercase
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
-from matplotlib.patches import Circle, Polygon
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Polygon, Rectangle
 
-from experiments.figures.style import ACTIVE, INACTIVE
+from experiments.figures.style import ACTIVE, CURVES, INACTIVE
 from experiments.runs.config import SceneConfig
 from experiments.runs.saved import Results
 
@@ -21,6 +25,34 @@ SMALLEST = 1e-12
 
 NO_RADIUS = 0.1
 """Radius of a disc in a scene without safety distance [m]."""
+
+
+def headline(figure: Figure, text: str) -> None:
+    """Write the headline of the figure."""
+    figure.suptitle(text, fontsize=9, x=0.01, ha="left")
+
+
+def name_panel(axes: Axes, number: int, text: str, **looks: Any) -> None:
+    """Write the title of a panel, with the letter of its number."""
+    axes.set_title(f"({ascii_lowercase[number]}) {text}", fontweight="bold", **looks)
+
+
+def marker(shape: str, colour: str, **looks: Any) -> Line2D:
+    """A marker for a legend."""
+    return Line2D([], [], ls="", marker=shape, color=colour, **looks)
+
+
+def positive(values: np.ndarray) -> np.ndarray:
+    """The values, with NaN for those that a logarithmic axis cannot show."""
+    return np.where(values > 0, values, np.nan)
+
+
+def add_curves(axes: Axes, t: np.ndarray, measures: Mapping[str, np.ndarray]) -> None:
+    """Draw the sizes and errors of one robot over time."""
+    for measure, label, looks in CURVES:
+        axes.semilogy(t, positive(measures[measure]), label=label, **looks)
+    axes.grid(True)
+    axes.set_xlim(t[0], t[-1])
 
 
 def disc_radius(config: SceneConfig) -> float:
@@ -48,15 +80,20 @@ def frame(axes: Axes, box: tuple[np.ndarray, np.ndarray]) -> None:
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
 
 
-def add_obstacles(axes: Axes, config: SceneConfig) -> list[Circle]:
-    """Draw inactive obstacles with their names, in the order of the configuration."""
+def add_box(axes: Axes, box: tuple[np.ndarray, np.ndarray], **looks: Any) -> None:
+    """Draw the edges of a box [m]."""
+    lower, upper = box
+    axes.add_patch(Rectangle(tuple(lower), *(upper - lower), fill=False, **looks))
+
+
+def add_obstacles(axes: Axes, config: SceneConfig, active: Sequence[str]) -> list[Circle]:
+    """Draw the obstacles with their names, in the order of the configuration."""
     discs = []
     for obstacle in config.obstacles:
         x, y = obstacle.position
-        disc = Circle((x, y), disc_radius(config), facecolor=INACTIVE, edgecolor="0.55", lw=0.6, zorder=2)
-        axes.add_patch(disc)
-        discs.append(disc)
-        axes.text(x, y, obstacle.name, ha="center", va="center", fontsize=7, color="0.35", zorder=4)
+        discs.append(axes.add_patch(Circle((x, y), disc_radius(config), lw=0.6)))
+        axes.text(x, y, obstacle.name, ha="center", va="center", fontsize=7, zorder=4)
+    darken(axes, discs, config, active)
     return discs
 
 
@@ -70,7 +107,7 @@ def darken(axes: Axes, discs: Sequence[Circle], config: SceneConfig, active: Seq
 
 def add_robot(axes: Axes, at: Sequence[float], radius: float, colour: str, *, solid: bool = True) -> Circle:
     """Draw a robot as a disc."""
-    face, edge = (colour, "white") if solid else (translucent(colour, 0.45), colour)
+    face, edge = (colour, "white") if solid else ((*to_rgb(colour), 0.45), colour)
     disc = Circle((at[0], at[1]), radius, facecolor=face, edgecolor=edge, lw=0.7, zorder=5)
     axes.add_patch(disc)
     return disc
@@ -78,7 +115,7 @@ def add_robot(axes: Axes, at: Sequence[float], radius: float, colour: str, *, so
 
 def add_region(axes: Axes, vertices: np.ndarray, colour: str, *, filled: bool, zorder: float = 1) -> Polygon:
     """Draw a set as a polygon."""
-    face = translucent(colour, 0.25) if filled else "none"
+    face = (*to_rgb(colour), 0.25) if filled else "none"
     region = Polygon(vertices, facecolor=face, edgecolor=colour, lw=1.1, zorder=zorder, joinstyle="round")
     axes.add_patch(region)
     return region
@@ -87,9 +124,3 @@ def add_region(axes: Axes, vertices: np.ndarray, colour: str, *, filled: bool, z
 def add_goal(axes: Axes, at: Sequence[float], colour: str = "black", size: float = 9) -> None:
     """Mark a goal."""
     axes.plot(at[0], at[1], "*", color=colour, ms=size, mec="white", mew=0.6, zorder=7)
-
-
-def translucent(colour: str, opacity: float) -> tuple[float, float, float, float]:
-    """The colour with this opacity, as (red, green, blue, opacity)."""
-    red, green, blue = to_rgb(colour)
-    return red, green, blue, opacity

@@ -8,6 +8,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from experiments.design.config import LearnedObserverConfig
+from experiments.figures.drawing import headline, name_panel
 from experiments.figures.style import HYBRID, INVERSE_OPTIMAL, REGION, ROBOT, UKF
 from experiments.results import read_columns
 
@@ -24,7 +25,6 @@ OBSERVERS = {
 }
 """Those that are drawn: colour and dashes. The others are in the tables."""
 
-LETTERS = "abcdefgh"
 CASES = {"A": "0.8", "B": INVERSE_OPTIMAL, "D": ROBOT}
 
 
@@ -40,11 +40,10 @@ def draw_learning(folder: Path, config: LearnedObserverConfig) -> Iterator[tuple
         shared = shared or axes
         for name, (colour, dashes) in OBSERVERS.items():
             of = curves.where(observer=name, noise=noise)
-            axes.semilogy(
-                of.numbers("t"), of.numbers("error"), color=colour, ls=dashes, lw=1.4, label=name.replace("ukf", "UKF")
-            )
+            looks = {"color": colour, "ls": dashes, "lw": 1.4, "label": name.replace("ukf", "UKF")}
+            axes.semilogy(of.numbers("t"), of.numbers("error"), **looks)
         axes.set(xlabel="t [s]", ylabel="mean error [m]" if i == 0 else "")
-        axes.set_title(f"({LETTERS[i]}) unseen teams, δ = {noise:g} m/s", fontweight="bold")
+        name_panel(axes, i, f"unseen teams, δ = {noise:g} m/s")
         axes.grid(True, which="both")
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=9, fontsize=7)
 
@@ -56,7 +55,7 @@ def draw_learning(folder: Path, config: LearnedObserverConfig) -> Iterator[tuple
             label = name if column == "training" else None
             training.plot(values, color=colour, ls=dashes, lw=1.3, label=label)
     training.set(xlabel="epoch", ylabel="mean error [m]")
-    training.set_title(f"({LETTERS[len(levels)]}) training (solid) and validation (dotted)", fontweight="bold")
+    name_panel(training, len(levels), "training (solid) and validation (dotted)")
     training.grid(True)
     training.legend(fontsize=7, loc="center right", bbox_to_anchor=(1, 0.38))
 
@@ -69,8 +68,8 @@ def draw_learning(folder: Path, config: LearnedObserverConfig) -> Iterator[tuple
             looks = {"color": colour, "ls": dashes, "lw": 4 if letter == "A" else 1.3}
             pull.semilogx(of.numbers("area"), of.numbers("pull"), label=label, **looks)
     pull.set(xlabel="area of Θ [m²]", ylabel="pull to the centroid", ylim=(0, 1))
-    pull.set_title(f"({LETTERS[len(levels) + 1]}) what the network has learned (solid: least noise)", fontweight="bold")
+    name_panel(pull, len(levels) + 1, "what the network has learned (solid: least noise)")
     pull.grid(True)
     pull.legend(fontsize=7)
-    figure.suptitle(config.title, fontsize=9, x=0.01, ha="left")
+    headline(figure, config.title)
     yield "figure", figure

@@ -10,10 +10,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.patches import Circle
 
 from experiments.design.config import ProbePlacementConfig
-from experiments.figures.drawing import add_goal, add_region, add_robot
+from experiments.figures.drawing import add_box, add_goal, add_region, add_robot, headline, name_panel
 from experiments.figures.style import HYBRID, INACTIVE, INVERSE_OPTIMAL, REGION, ROBOT, UKF
 from experiments.results import Columns, read_columns, read_json, reading
 
@@ -22,7 +22,6 @@ SEEN = 0.95
 """The map shows the places from which a probe brings the area below this share of the largest, and the robot."""
 
 TICKS = [digit * 10.0**power for power in range(-6, 3) for digit in (1, 2, 3, 5, 7)]
-LETTERS = "abcdefghijkl"
 METHODS = {
     "none": ("no probe", "0.4"),
     "one_random": ("one at random", "0.4"),
@@ -46,7 +45,7 @@ def draw_search(folder: Path, config: ProbePlacementConfig) -> Figure:
     _methods(figure.add_subplot(grid[:, 2]), folder, config)
     _cosines(figure.add_subplot(grid[1, 0]), folder)
     _switches(figure.add_subplot(grid[1, 1]), folder)
-    figure.suptitle(f"{config.title}: {config.scenes} corridors, held-out goals", fontsize=9, x=0.01, ha="left")
+    headline(figure, f"{config.title}: {config.scenes} corridors, held-out goals")
     return figure
 
 
@@ -86,7 +85,7 @@ def _landscape(axes: Axes, folder: Path, config: ProbePlacementConfig) -> None:
     left, bottom = np.maximum(seen.min(0) - 0.05, config.room.lower)
     right, top = np.minimum(seen.max(0) + 0.05, config.room.upper)
     axes.set(xlabel="x of a probe that stands still [m]", ylabel="y [m]", xlim=(left, right), ylim=(bottom, top))
-    axes.set_title("(a) the area a still probe leaves; white: Adam's ways", fontweight="bold")
+    name_panel(axes, 0, "the area a still probe leaves; white: Adam's ways")
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=4, fontsize=7, columnspacing=1.2)
 
 
@@ -139,7 +138,7 @@ def _methods(axes: Axes, folder: Path, config: ProbePlacementConfig) -> None:
     axes.set_ylim(min(ticks) - 0.6, 0.6)
     axes.grid(True, axis="x")
     number = config.search.starts * config.search.steps
-    axes.set_title(f"(b) the methods, {number} placements each", fontweight="bold")
+    name_panel(axes, 1, f"the methods, {number} placements each")
 
 
 def _cosines(axes: Axes, folder: Path) -> None:
@@ -154,7 +153,7 @@ def _cosines(axes: Axes, folder: Path) -> None:
                 axes.plot(of.numbers("horizon"), of.numbers(column), dashes, label=label, **looks)
     axes.axhline(0.95, color="0.6", lw=0.6)
     axes.set(xlabel="samples", ylabel="cosine", ylim=(-1.9, 1.05), yticks=(-1, -0.5, 0, 0.5, 1))
-    axes.set_title("(c) gradient against differences", fontweight="bold")
+    name_panel(axes, 2, "gradient against differences")
     axes.grid(True)
     axes.legend(fontsize=6, title="circles: still, squares: path", title_fontsize=6, loc="lower right", ncols=2)
 
@@ -167,7 +166,7 @@ def _switches(axes: Axes, folder: Path) -> None:
         axes.plot(y[history == i], log_area[history == i], "-", color=REGION, lw=1.6, label=None if i else "log A")
     axes.plot(y, by_derivatives, ":", color=UKF, lw=1.4, label="its derivatives, added up")
     axes.set(xlabel="y of a still probe [m]", ylabel="log of the area left")
-    axes.set_title(f"(d) one goal: {history[-1]} switches", fontweight="bold")
+    name_panel(axes, 3, f"one goal: {history[-1]} switches")
     axes.grid(True)
     bottom, top = axes.get_ylim()
     axes.set_ylim(bottom - 0.25 * (top - bottom), top)
@@ -179,13 +178,14 @@ def draw_before_after(replay: dict[str, Any], config: ProbePlacementConfig) -> F
     runs: list[dict[str, Any]] = replay["runs"]
     figure = Figure(figsize=(11.5, 4.6), layout="constrained")
     grid = figure.subplots(2, 1 + (len(runs) - 1 + 1) // 2, squeeze=False)
-    cells, curves = [grid[0, 0], *grid[0, 1:], *grid[1, 1:]], grid[1, 0]
     columns = grid.shape[1]
-    order = [runs[0], *_by_way_points(runs[1:])]
-    letters = [*LETTERS[:columns], *LETTERS[columns + 1 :]]
-    for letter, axes, run in zip(letters, cells, order, strict=False):
+    panels, curves = [*enumerate(grid.flat)], grid[1, 0]
+    del panels[columns]  # for the curves
+    # A row of maps for each method. Its columns are the numbers of way-points.
+    order = [runs[0], *sorted(runs[1:], key=lambda run: (run["method"] != "random", run["way_points"]))]
+    for (i, axes), run in zip(panels, order, strict=False):
         draw_map(axes, replay, run, config, len(run["samples"]) - 1)
-        axes.set_title(f"({letter}) {name_of(run)}: {run['samples'][-1]['area']:.3g} m²", fontweight="bold")
+        name_panel(axes, i, f"{name_of(run)}: {run['samples'][-1]['area']:.3g} m²")
     for run in order:
         t = [sample["t"] for sample in run["samples"]]
         colour = METHODS[run["method"]][1]
@@ -193,19 +193,12 @@ def draw_before_after(replay: dict[str, Any], config: ProbePlacementConfig) -> F
         areas = [sample["area"] for sample in run["samples"]]
         curves.semilogy(t, areas, color=colour, ls=dashes, lw=1.5, label=name_of(run))
     curves.set(xlabel="t [s]", ylabel="area of Θ(t) [m²]")
-    curves.set_title(f"({LETTERS[columns]}) over time", fontweight="bold")
+    name_panel(curves, columns, "over time")
     curves.grid(True)
     curves.set_ylim(bottom=curves.get_ylim()[0] / 8)
     curves.legend(fontsize=7, loc="lower left")
-    figure.suptitle(
-        f"{config.title}: what is left of Θ after {config.duration:g} s, for one goal", fontsize=9, x=0.01, ha="left"
-    )
+    headline(figure, f"{config.title}: what is left of Θ after {config.duration:g} s, for one goal")
     return figure
-
-
-def _by_way_points(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A row of maps for each method. Its columns are the numbers of way-points."""
-    return sorted(runs, key=lambda run: (run["method"] != "random", run["way_points"]))
 
 
 def name_of(run: dict[str, Any]) -> str:
@@ -220,8 +213,7 @@ def draw_map(axes: Axes, replay: dict[str, Any], run: dict[str, Any], config: Pr
     """The corridor at sample k: Theta, the robot and its path, the probe and its path."""
     sample, radius = run["samples"][k], config.safety_distance / 2
     lower, upper = np.array(config.prior.lower), np.array(config.prior.upper)
-    width, height = upper - lower
-    axes.add_patch(Rectangle(tuple(lower), width, height, fc="none", ec=REGION, ls=":", lw=0.8))
+    add_box(axes, (lower, upper), ec=REGION, ls=":", lw=0.8)
     add_region(axes, np.array(sample["vertices"]), REGION, filled=True)
     active = sample["active"]
     bodies = [*replay["obstacles"], *([sample["probe"]] if sample["probe"] else [])]

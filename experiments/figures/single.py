@@ -2,29 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from string import ascii_lowercase
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.legend_handler import HandlerTuple
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
-from experiments.figures.drawing import (
-    add_goal,
-    add_obstacles,
-    add_region,
-    add_robot,
-    darken,
-    disc_radius,
-    frame,
-    map_frame,
-    padded,
-)
+from experiments.figures import drawing
 from experiments.figures.style import (
     ACTIVE,
-    CURVES,
     HYBRID,
     INACTIVE,
     INVERSE_OPTIMAL,
@@ -49,11 +37,11 @@ def draw_single(results: Results, config: SceneConfig) -> Figure:
     figure = Figure(figsize=(2.45 * count + 3.6, 4.9), layout="constrained")
     figure.get_layout_engine().set(w_pad=0.04, h_pad=0.04, wspace=0.03, hspace=0.03)  # type: ignore[union-attr]
     grid = figure.add_gridspec(2, count + 1, width_ratios=[*[2.45] * count, 3.2])
-    box = map_frame(results, config, ASPECT)
+    box = drawing.map_frame(results, config, ASPECT)
     for column, k in enumerate(samples):
         above, below = figure.add_subplot(grid[0, column]), figure.add_subplot(grid[1, column])
         _draw_map(above, results, config, k, box)
-        above.set_title(f"({chr(ord('a') + column)})  t = {results.t[k]:.2f} s", fontweight="bold")
+        drawing.name_panel(above, column, f" t = {results.t[k]:.2f} s")
         _draw_region(below, results, k, box)
         if column == 0:
             above.set_ylabel("y [m]")
@@ -61,24 +49,23 @@ def draw_single(results: Results, config: SceneConfig) -> Figure:
     right = grid[:, count].subgridspec(2, 1, height_ratios=(7, 1))
     errors = figure.add_subplot(right[0])
     strip = figure.add_subplot(right[1], sharex=errors)
-    draw_errors(errors, results, samples)
-    errors.set_title(f"({chr(ord('a') + count)})  sizes and errors [m]", fontweight="bold", pad=13)
-    draw_strip(strip, results)
-    figure.suptitle(f"{config.title}   {_settings(config)}", fontsize=9, x=0.01, ha="left")
+    _draw_errors(errors, results, samples)
+    drawing.name_panel(errors, count, " sizes and errors [m]", pad=13)
+    _draw_strip(strip, results)
+    drawing.headline(figure, f"{config.title}   {_settings(config)}")
     _add_legends(figure, errors)
     return figure
 
 
 def _draw_map(axes: Axes, results: Results, config: SceneConfig, k: int, box: tuple[np.ndarray, np.ndarray]) -> None:
     region, path = results.regions[k][0], results.paths[config.robots[0].name]
-    add_region(axes, region.vertices["critical_region"], REGION, filled=True)
-    discs = add_obstacles(axes, config)
-    darken(axes, discs, config, region.active)
+    drawing.add_region(axes, region.vertices["critical_region"], REGION, filled=True)
+    drawing.add_obstacles(axes, config, region.active)
     axes.plot(*path[: k + 1].T, color=ROBOT, lw=1.1, zorder=4.5)
-    add_robot(axes, path[k], disc_radius(config), ROBOT)
-    add_goal(axes, results.goals[0])
+    drawing.add_robot(axes, path[k], drawing.disc_radius(config), ROBOT)
+    drawing.add_goal(axes, results.goals[0])
     _add_estimates(axes, results, k, np.zeros(2))
-    frame(axes, box)
+    drawing.frame(axes, box)
     axes.set_xlabel("x [m]")
 
 
@@ -86,17 +73,15 @@ def _draw_region(axes: Axes, results: Results, k: int, box: tuple[np.ndarray, np
     """The region about the goal, to its own scale. A dashed frame is the frame of the map."""
     region, goal = results.regions[k][0], results.goals[0]
     for kind, filled in (("critical_region", True), ("inverse_optimal", False)):
-        drawn = add_region(axes, region.vertices[kind] - goal, SET_COLOURS[kind], filled=filled)
+        drawn = drawing.add_region(axes, region.vertices[kind] - goal, SET_COLOURS[kind], filled=filled)
         if not filled:
             drawn.set(linestyle=(0, (3, 2)), zorder=1.5)
-    add_goal(axes, (0.0, 0.0))
+    drawing.add_goal(axes, (0.0, 0.0))
     _add_estimates(axes, results, k, goal)
     vertices = np.vstack([region.vertices["critical_region"] - goal, np.zeros((1, 2))])
-    frame(axes, padded(vertices.min(0), vertices.max(0), ASPECT, 1.25))
-    (left, bottom), (right, top) = box - goal
-    axes.add_patch(
-        Rectangle((left, bottom), right - left, top - bottom, fill=False, ec="0.45", lw=0.7, ls=(0, (1, 1.5)))
-    )
+    drawing.frame(axes, drawing.padded(vertices.min(0), vertices.max(0), ASPECT, 1.25))
+    lower, upper = box
+    drawing.add_box(axes, (lower - goal, upper - goal), ec="0.45", lw=0.7, ls=(0, (1, 1.5)))
     axes.set_xlabel("x − goal [m]")
     axes.locator_params(nbins=5)
     region_size, other_size = (length(np.sqrt(results.of_set(kind, "volume")[k, 0])) for kind in SETS)
@@ -113,31 +98,17 @@ def _add_estimates(axes: Axes, results: Results, k: int, origin: np.ndarray) -> 
     axes.plot(*hybrid, "D", color=HYBRID, ms=7.5, mfc="none", mew=1.4, zorder=7.5)
 
 
-def draw_errors(axes: Axes, results: Results, samples: list[int]) -> None:
+def _draw_errors(axes: Axes, results: Results, samples: list[int]) -> None:
     """Errors and sizes over time, with the snapshots marked."""
-    measures = lengths(results)
-    for curve in CURVES:
-        values = measures[curve.measure][:, 0]
-        axes.semilogy(results.t, np.where(values > 0, values, np.nan), label=curve.label, **curve.looks)
-    for column, k in enumerate(samples):
-        axes.axvline(results.t[k], color="0.6", lw=0.7, ls=(0, (1, 1.5)), zorder=0)
-        letter = f"({chr(ord('a') + column)})"
-        axes.text(
-            results.t[k],
-            1.0,
-            letter,
-            transform=axes.get_xaxis_transform(),
-            ha="center",
-            va="bottom",
-            fontsize=7,
-            color="0.4",
-        )
-    axes.grid(True)
+    drawing.add_curves(axes, results.t, {name: values[:, 0] for name, values in lengths(results).items()})
+    looks = {"ha": "center", "va": "bottom", "fontsize": 7, "color": "0.4"}
+    for letter, t in zip(ascii_lowercase, results.t[samples], strict=False):
+        axes.axvline(t, color="0.6", lw=0.7, ls=(0, (1, 1.5)), zorder=0)
+        axes.text(t, 1.0, f"({letter})", transform=axes.get_xaxis_transform(), **looks)
     axes.tick_params(labelbottom=False)
-    axes.set_xlim(results.t[0], results.t[-1])
 
 
-def draw_strip(axes: Axes, results: Results) -> None:
+def _draw_strip(axes: Axes, results: Results) -> None:
     """The number of active rows over time."""
     active = results.n_active()[:, 0]
     axes.fill_between(results.t, active, step="post", color=ACTIVE, alpha=0.75, lw=0)
@@ -154,19 +125,16 @@ def _settings(config: SceneConfig) -> str:
 
 
 def _add_legends(figure: Figure, errors: Axes) -> None:
-    def marker(shape: str, colour: str, **looks: Any) -> Line2D:
-        return Line2D([], [], ls="", marker=shape, color=colour, **looks)
-
-    obstacles = tuple(marker("o", colour, ms=8, mec="0.4") for colour in (ACTIVE, INACTIVE))
+    obstacles = tuple(drawing.marker("o", colour, ms=8, mec="0.4") for colour in (ACTIVE, INACTIVE))
     entries = [
-        (marker("o", ROBOT, ms=9), "robot"),
-        (marker("*", "black", ms=10), "goal"),
+        (drawing.marker("o", ROBOT, ms=9), "robot"),
+        (drawing.marker("*", "black", ms=10), "goal"),
         (obstacles, "obstacle: active, inactive"),
         (Rectangle((0, 0), 1, 1, fill=False, ec="0.45", ls=(0, (1, 1.5))), "frame of the map above"),
         (Patch(facecolor="#BFE7DC", edgecolor=REGION), "paper's region"),
         (Patch(facecolor="none", edgecolor=INVERSE_OPTIMAL, ls=(0, (3, 2))), "inverse-optimal set"),
-        (marker("x", UKF, ms=7, mew=1.8), "UKF"),
-        (marker("D", HYBRID, ms=6.5, mfc="none", mew=1.4), "hybrid estimate"),
+        (drawing.marker("x", UKF, ms=7, mew=1.8), "UKF"),
+        (drawing.marker("D", HYBRID, ms=6.5, mfc="none", mew=1.4), "hybrid estimate"),
     ]
     handles, labels = zip(*entries, strict=True)
     looks = {"handler_map": {tuple: HandlerTuple(None)}, "columnspacing": 1.6}

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from matplotlib.typing import RcKeyType
+
+    from experiments.runs.config import SceneConfig
 
 STYLE: dict[RcKeyType, Any] = {
     "font.size": 8.5,
@@ -40,34 +41,25 @@ ACTIVE, INACTIVE = "0.25", "0.82"
 TEAM = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F5539", "#4D4D4D")
 """One colour per robot, reused in turn beyond eight."""
 
+
+def team_colours(config: SceneConfig) -> list[str]:
+    """The colours of the robots of a team."""
+    return [TEAM[i % len(TEAM)] for i in range(len(config.robots))]
+
+
 SET_COLOURS = {"critical_region": REGION, "inverse_optimal": INVERSE_OPTIMAL}
 SET_NAMES = {"critical_region": "paper's region Θ", "inverse_optimal": "inverse-optimal set"}
 
 
-@dataclass(frozen=True)
-class Curve:
-    """A line in the comparison of errors.
-
-    Attributes:
-        measure: its name in `experiments.runs.lengths.lengths`.
-        label: its label in the legend.
-        looks: its style, as options of matplotlib.
-    """
-
-    measure: str
-    label: str
-    looks: dict[str, Any]
-
-
-CURVES = (
-    Curve("critical_region sqrt_area", "region √area", {"color": REGION, "lw": 1.6}),
-    Curve("critical_region diameter", "region diameter", {"color": REGION, "lw": 1.1, "ls": (0, (4, 1.5))}),
-    Curve("inverse_optimal sqrt_area", "inv.-opt. √area", {"color": INVERSE_OPTIMAL, "lw": 1.6}),
-    Curve("inverse_optimal diameter", "inv.-opt. diameter", {"color": INVERSE_OPTIMAL, "lw": 1.1, "ls": (0, (4, 1.5))}),
-    Curve("ukf", "UKF error", {"color": UKF, "lw": 1.8}),
-    Curve("hybrid", "hybrid error", {"color": HYBRID, "lw": 1.4, "ls": (0, (1, 1))}),
+CURVES: tuple[tuple[str, str, dict[str, Any]], ...] = (
+    ("critical_region sqrt_area", "region √area", {"color": REGION, "lw": 1.6}),
+    ("critical_region diameter", "region diameter", {"color": REGION, "lw": 1.1, "ls": (0, (4, 1.5))}),
+    ("inverse_optimal sqrt_area", "inv.-opt. √area", {"color": INVERSE_OPTIMAL, "lw": 1.6}),
+    ("inverse_optimal diameter", "inv.-opt. diameter", {"color": INVERSE_OPTIMAL, "lw": 1.1, "ls": (0, (4, 1.5))}),
+    ("ukf", "UKF error", {"color": UKF, "lw": 1.8}),
+    ("hybrid", "hybrid error", {"color": HYBRID, "lw": 1.4, "ls": (0, (1, 1))}),
 )
-
+"""The comparison of sizes and errors: name in `experiments.runs.lengths.lengths`, label, options of matplotlib."""
 
 UNITS = ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm"), (1e-9, "nm"))
 

@@ -11,7 +11,7 @@ from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from experiments.figures.drawing import NO_RADIUS
+from experiments.figures.drawing import NO_RADIUS, frame, headline, name_panel
 from experiments.figures.style import INVERSE_OPTIMAL
 from experiments.results import Columns, read_columns, read_json, reading
 from experiments.runs.config import SwarmConfig
@@ -47,19 +47,15 @@ def draw_swarm(folder: Path, config: SwarmConfig) -> Iterator[tuple[str, Figure]
         )
         discs.set(array=robots.numbers("sqrt_area")[at].clip(min=smallest), norm=norm, edgecolor="0.3", linewidth=0.2)
         axes.add_collection(discs)
-        half = 0.52 * config.side
-        axes.set(xlim=(-half, half), ylim=(-half, half), aspect="equal", xlabel="x [m]")
-        axes.set_title(f"({chr(ord('a') + i)})  t = {t:.4g} s", fontweight="bold")
+        corner = np.full(2, 0.52 * config.side)
+        frame(axes, (-corner, corner))
+        axes.set_xlabel("x [m]")
+        name_panel(axes, i, f" t = {t:.4g} s")
     panels[0].set_ylabel("y [m]")
     if discs is not None:
         figure.colorbar(discs, ax=panels[:-1], label="√area of the goal's set [m]", shrink=0.8, pad=0.01)
     _draw_sizes(panels[-1], sizes)
-    figure.suptitle(
-        f"{config.title}, {config.steps} steps: truth lost for {lost} of {config.robots}",
-        fontsize=9,
-        x=0.01,
-        ha="left",
-    )
+    headline(figure, f"{config.title}, {config.steps} steps: truth lost for {lost} of {config.robots}")
     yield "figure", figure
 
 

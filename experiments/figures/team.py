@@ -4,23 +4,13 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from experiments.figures.drawing import (
-    add_goal,
-    add_obstacles,
-    add_region,
-    add_robot,
-    darken,
-    disc_radius,
-    frame,
-    map_frame,
-)
-from experiments.figures.style import SET_NAMES, TEAM
+from experiments.figures import drawing
+from experiments.figures.style import SET_NAMES, team_colours
 from experiments.runs.config import SceneConfig
 from experiments.runs.lengths import lengths
 from experiments.runs.saved import Results
@@ -39,66 +29,60 @@ def draw_team(results: Results, config: SceneConfig) -> Figure:
     rows = math.ceil(len(config.snapshots) / columns)
     figure = Figure(figsize=(3.7 * columns, 3.75 * rows + 0.4), layout="constrained")
     grid = figure.add_gridspec(rows, columns)
-    box = map_frame(results, config, aspect=1.0)
+    box = drawing.map_frame(results, config, aspect=1.0)
     for i, t in enumerate(config.snapshots):
         k, axes = results.at(t), figure.add_subplot(grid[divmod(i, columns)])
-        draw_snapshot(axes, results, config, k)
-        frame(axes, box)
-        axes.set_title(f"({chr(ord('a') + i)})  t = {results.t[k]:.2f} s", fontweight="bold")
+        _draw_snapshot(axes, results, config, k)
+        drawing.frame(axes, box)
+        drawing.name_panel(axes, i, f" t = {results.t[k]:.2f} s")
         if i // columns == rows - 1:
             axes.set_xlabel("x [m]")
         if i % columns == 0:
             axes.set_ylabel("y [m]")
-    figure.suptitle(f"{config.title}: {SET_NAMES[config.set]} of each goal", fontsize=9, x=0.01, ha="left")
+    drawing.headline(figure, f"{config.title}: {SET_NAMES[config.set]} of each goal")
     handles = [
-        Line2D([], [], ls="", marker="o", mfc="0.8", mec="0.45", ms=9),
-        Line2D([], [], ls="", marker="*", color="0.45", ms=10),
-        Line2D([], [], ls="", marker="x", color="0.45", ms=6, mew=1.6),
+        drawing.marker("o", "0.45", mfc="0.8", ms=9),
+        drawing.marker("*", "0.45", ms=10),
+        drawing.marker("x", "0.45", ms=6, mew=1.6),
         Patch(facecolor="0.88", edgecolor="0.45"),
     ]
     figure.legend(handles, ["robot", "its goal", "its UKF estimate", "its region"], loc="outside lower center", ncols=4)
     return figure
 
 
-def draw_snapshot(axes: Axes, results: Results, config: SceneConfig, k: int) -> None:
+def _draw_snapshot(axes: Axes, results: Results, config: SceneConfig, k: int) -> None:
     """The map at sample k, with every robot's region."""
-    discs = add_obstacles(axes, config)
-    darken(axes, discs, config, [name for region in results.regions[k] for name in region.active])
-    for i, robot in enumerate(config.robots):
-        colour, path = TEAM[i % len(TEAM)], results.paths[robot.name]
-        add_region(axes, results.regions[k][i].vertices[config.set], colour, filled=True, zorder=5.5)
+    drawing.add_obstacles(axes, config, [name for region in results.regions[k] for name in region.active])
+    for i, (robot, colour) in enumerate(zip(config.robots, team_colours(config), strict=True)):
+        path = results.paths[robot.name]
+        drawing.add_region(axes, results.regions[k][i].vertices[config.set], colour, filled=True, zorder=5.5)
         axes.plot(*path[: k + 1].T, color=colour, lw=1.0, zorder=4.5)
-        add_robot(axes, path[k], disc_radius(config), colour, solid=False)
-        add_goal(axes, robot.goal, colour, size=11)
+        drawing.add_robot(axes, path[k], drawing.disc_radius(config), colour, solid=False)
+        drawing.add_goal(axes, robot.goal, colour, size=11)
         ukf = results.numbers("ukf_0", "ukf_1")[k, i]
         axes.plot(*ukf, "x", color=colour, ms=6, mew=1.6, zorder=8)
 
 
 def draw_comparison(results: Results, config: SceneConfig) -> Figure:
     """Lengths over time, one colour per robot: both kinds of set, the filter, the hybrid."""
-    measures = lengths(results)
+    measures, colours = lengths(results), team_colours(config)
     figure = Figure(figsize=(11, 3.5), layout="constrained")
     all_axes = figure.subplots(1, len(PANELS), sharex=True, sharey=True)
     for axes, (name, title) in zip(all_axes, PANELS, strict=True):
-        for i in range(len(config.robots)):
-            colour = TEAM[i % len(TEAM)]
-            if name in measures:
-                _draw_line(axes, results.t, measures[name][:, i], colour, lw=1.5)
-            else:
-                _draw_line(axes, results.t, measures[f"{name} sqrt_area"][:, i], colour, lw=1.5)
-                _draw_line(axes, results.t, measures[f"{name} diameter"][:, i], colour, lw=1.0, ls=(0, (4, 1.5)))
+        main = drawing.positive(measures[name] if name in measures else measures[f"{name} sqrt_area"])
+        for i, colour in enumerate(colours):
+            axes.semilogy(results.t, main[:, i], color=colour, lw=1.5)
+            if name not in measures:
+                diameter = drawing.positive(measures[f"{name} diameter"][:, i])
+                axes.semilogy(results.t, diameter, color=colour, lw=1.0, ls=(0, (4, 1.5)))
         for k in map(results.at, config.snapshots):
             axes.axvline(results.t[k], color="0.6", lw=0.7, ls=(0, (1, 1.5)), zorder=0)
         axes.grid(True)
         axes.set(title=title, xlabel="t [s]", xlim=(results.t[0], results.t[-1]))
     all_axes[0].set_ylabel("length [m]")
-    figure.suptitle(f"{config.title}, dotted: the snapshots", fontsize=9, x=0.01, ha="left")
-    robots = [Line2D([], [], color=TEAM[i % len(TEAM)], lw=1.8) for i in range(len(config.robots))]
+    drawing.headline(figure, f"{config.title}, dotted: the snapshots")
+    robots = [Line2D([], [], color=colour, lw=1.8) for colour in colours]
     looks = [Line2D([], [], color="0.4", lw=1.5), Line2D([], [], color="0.4", lw=1.0, ls=(0, (4, 1.5)))]
     labels = [*(robot.name for robot in config.robots), "√area, error", "diameter"]
     figure.legend([*robots, *looks], labels, loc="outside lower center", ncols=len(labels))
     return figure
-
-
-def _draw_line(axes: Axes, t: np.ndarray, values: np.ndarray, colour: str, **looks: object) -> None:
-    axes.semilogy(t, np.where(values > 0, values, np.nan), color=colour, **looks)

@@ -36,7 +36,7 @@ def run_cases(config: CasesConfig, out: Path, track: Track) -> dict[str, Any]:
     """Simulate, observe, and return the summary."""
     observers = Observers(config, record_cases(config))
     observe(observers, out, track)
-    summary = measure_cases(Results(out, config), observers)
+    summary = measure_cases(config, Results(out, config), observers)
     write_rows(out / "cases.csv", summary["cases"])
     return summary
 
@@ -76,7 +76,8 @@ def _places(case: CaseConfig, config: CasesConfig) -> tuple[Tensor, Tensor, Tens
         Offsets (m, 2) from the robot at the start [m], radii (m,) [m], and which slots hold a body (m,).
     """
     slots, taken = _slots(config), len(case.bodies)
-    gamma, margin = known(config.avoidance.class_k.gain), known(config.avoidance.margin)
+    (avoidance,) = config.barriers
+    gamma, margin = known(avoidance.class_k.gain), known(avoidance.margin)
     assert gamma is not None
     assert margin is not None
     offsets = torch.ones(slots, 2, dtype=torch.float64)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Annotated, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -19,17 +19,12 @@ from torchfsid.config.observers import NoiseConfig, PriorConfig, UkfConfig
 from torchfsid.config.quantities import BodyName, NonNegative, Number, PlanarVector, Positive, known
 from torchfsid.config.tasks import GoalConfig
 
-if TYPE_CHECKING:
-    from torchfsid.identification.evidence import SetKind
-    from torchfsid.observers.set_membership import SetMembershipObserver
-    from torchfsid.robots.barriers import Barrier
-    from torchfsid.robots.tasks import Task
-
 MAX_STEPS = 1_000_000
 """More is a slip of the pen in dt or duration."""
 
 Text = Annotated[str, Field(min_length=1)]
 WholeNumber = Annotated[int, Field(strict=True, ge=0)]
+Count = Annotated[int, Field(strict=True, ge=1)]
 
 
 class RobotConfig(Strict):
@@ -142,33 +137,25 @@ class ExperimentConfig(Strict):
         for i, barrier in enumerate(self.barriers):
             if barrier.is_unknown:
                 raise wrong("expected numbers, not [low, high]: robots that are simulated have them", f"barriers[{i}]")
-        return self
-
-    def build_sets(self, kind: SetKind, task: Task, barriers: Sequence[Barrier], robots: int) -> SetMembershipObserver:
-        """The observer of one kind of set.
-
-        The critical region uses the active tolerance as its only bound, also to decide on alarms.
-        """
-        from torchfsid.observers.set_membership import SetMembershipObserver
-
-        noise = self.noise.build() if kind == "inverse_optimal" else None
-        prior = self.prior.build(robots)
-        return SetMembershipObserver(
-            task, barriers, prior, kind=kind, noise=noise, active_tolerance=self.active_tolerance
-        )
-
-    @model_validator(mode="after")
-    def _fits_the_task(self) -> ExperimentConfig:
         if len(self.prior.lower) != self.task.parameters:
             raise wrong(f"a goal has {self.task.parameters} entries, lower has {len(self.prior.lower)}", "prior")
-        if not 1 <= self.duration / self.dt <= MAX_STEPS:
-            raise wrong(f"expected 1 to {MAX_STEPS} steps of dt = {self.dt} s, got {self.duration} s", "duration")
+        require_steps(self.duration, self.dt)
         return self
 
     def _require_in_prior(self, goal: Sequence[float], path: str) -> None:
         bounds = zip(self.prior.lower, goal, self.prior.upper, strict=True)
         if not all(low <= x <= high for low, x, high in bounds):
             raise wrong(f"the prior does not hold it: {list(goal)}", path)
+
+    def _require_no_radii(self, bodies: str) -> None:
+        for i, barrier in enumerate(self.barriers):
+            if barrier.uses_radius:
+                raise wrong(f"bodies of a {bodies} have no radius: give safety_distance", f"barriers[{i}].margin")
+
+    def _require_in_time(self, snapshots: Sequence[float]) -> None:
+        require_increasing(snapshots, "snapshots")
+        if snapshots[-1] > self.duration:
+            raise wrong(f"must not be after the end, {self.duration} s, got {snapshots[-1]}", "snapshots")
 
 
 class SceneConfig(ExperimentConfig):
@@ -203,16 +190,8 @@ class SceneConfig(ExperimentConfig):
             raise wrong(f"two bodies are called {repeated[0]!r}", "robots, obstacles")
         for i, robot in enumerate(self.robots):
             self._require_in_prior(robot.goal, f"robots[{i}].goal")
-        for i, barrier in enumerate(self.barriers):
-            if barrier.uses_radius:
-                raise wrong("bodies of a scene have no radius: give safety_distance", f"barriers[{i}].margin")
-        require_increasing(self.snapshots, "snapshots")
-        if self.snapshots[-1] > self.duration:
-            raise wrong(f"must not be after the end, {self.duration} s, got {self.snapshots[-1]}", "snapshots")
-        self._check_expected()
-        return self
-
-    def _check_expected(self) -> None:
+        self._require_no_radii("scene")
+        self._require_in_time(self.snapshots)
         if self.expected and len(self.robots) > 1:
             raise wrong("only a scene of one robot has an expected timeline", "expected")
         require_increasing([interval.until for interval in self.expected], "expected")
@@ -220,6 +199,7 @@ class SceneConfig(ExperimentConfig):
         for i, interval in enumerate(self.expected):
             if unknown := [name for name in interval.active or () if name not in obstacles]:
                 raise wrong(f"no obstacle is called {unknown[0]!r}", f"expected[{i}].active")
+        return self
 
 
 class CaseBodyConfig(Strict):
@@ -259,24 +239,19 @@ class CasesConfig(ExperimentConfig):
     Attributes:
         start: start of the robot, in every case [m].
         goal: goal of the robot, in every case [m].
+        barriers: the only barrier. The places of the bodies follow from its rows.
         radius: radius of the robot [m].
         spin: angular rate at which the directions turn [deg/s].
         cases: the cases.
     """
 
     kind: Literal["cases"]
+    barriers: tuple[AvoidanceConfig]
     start: PlanarVector
     goal: PlanarVector
     radius: Positive
     spin: Number = 0.0
     cases: Annotated[tuple[CaseConfig, ...], Field(min_length=1)]
-
-    @property
-    def avoidance(self) -> AvoidanceConfig:
-        """The only barrier. The places of the bodies follow from its rows."""
-        barrier = self.barriers[0]
-        assert isinstance(barrier, AvoidanceConfig)
-        return barrier
 
     @model_validator(mode="after")
     def _is_a_table(self) -> CasesConfig:
@@ -284,8 +259,8 @@ class CasesConfig(ExperimentConfig):
         names = [case.name for case in self.cases]
         if repeated := [name for i, name in enumerate(names) if name in names[:i]]:
             raise wrong(f"two cases are called {repeated[0]!r}", "cases")
-        barrier = self.barriers[0]
-        if len(self.barriers) > 1 or not isinstance(barrier, AvoidanceConfig) or barrier.margin is None:
+        (barrier,) = self.barriers
+        if barrier.margin is None:
             raise wrong("expected one avoidance barrier with a margin", "barriers")
         if (barrier.distance, barrier.class_k.power, barrier.neighbour_velocity) != ("squared", 1, "none"):
             raise wrong("expected the paper's row: squared, power 1, neighbour_velocity none", "barriers[0]")
@@ -308,11 +283,11 @@ class SwarmConfig(ExperimentConfig):
     """
 
     kind: Literal["swarm"]
-    robots: Annotated[int, Field(strict=True, ge=1)]
+    robots: Count
     side: Positive
     separation: NonNegative
     travel: Positive
-    neighbours: Annotated[int, Field(strict=True, ge=1)]
+    neighbours: Count
     sensing_radius: Positive
     seed: WholeNumber
     measurement_noise: MeasurementNoiseConfig = MeasurementNoiseConfig()
@@ -334,12 +309,15 @@ class SwarmConfig(ExperimentConfig):
         for i, barrier in enumerate(self.barriers):
             if barrier.neighbour_velocity == "current":
                 raise wrong("no joint QP over a swarm: none or previous", f"barriers[{i}].neighbour_velocity")
-            if barrier.uses_radius:
-                raise wrong("bodies of a swarm have no radius: give safety_distance", f"barriers[{i}].margin")
-        require_increasing(self.snapshots, "snapshots")
-        if self.snapshots[-1] > self.duration:
-            raise wrong(f"must not be after the end, {self.duration} s, got {self.snapshots[-1]}", "snapshots")
+        self._require_no_radii("swarm")
+        self._require_in_time(self.snapshots)
         return self
+
+
+def require_steps(duration: float, dt: float) -> None:
+    """Check, in a validator, that a run has a number of steps that can be run."""
+    if not 1 <= duration / dt <= MAX_STEPS:
+        raise wrong(f"expected 1 to {MAX_STEPS} steps of dt = {dt} s, got {duration} s", "duration")
 
 
 def require_increasing(times: Sequence[float], path: str) -> None:

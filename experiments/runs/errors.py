@@ -87,7 +87,6 @@ def in_disc(random: np.random.Generator, radius: float, shape: tuple[int, ...]) 
 
 
 def _on_circle(random: np.random.Generator, radius: float, shape: tuple[int, ...]) -> Float[Tensor, "*shape 2"]:
-    """Points uniformly distributed on a circle."""
     return radius * _towards(torch.from_numpy(random.uniform(0, 2 * np.pi, size=shape)))
 
 

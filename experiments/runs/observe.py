@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from experiments.kinds import Track
@@ -15,7 +16,9 @@ from experiments.results import Appender
 from experiments.runs.observers import Observers
 from experiments.runs.recording import Recording
 from torchfsid.commands.results import ResultsWriter
+from torchfsid.commands.safety_results import without_repeats
 from torchfsid.observers.set_membership import SetEstimate
+from torchfsid.programmes.differentiable import times
 from torchfsid.robots.barriers import stack_barriers
 from torchfsid.robots.measurement import Measurement
 
@@ -41,7 +44,7 @@ def _regions(recording: Recording, measurement: Measurement, sets: dict[str, Set
     real = (rows.A != 0).any(-1)
     active = next(iter(sets.values())).kkt.active
     C, d = recording.task(measurement)
-    nominal = (C @ recording.goals.unsqueeze(-1)).squeeze(-1) + d
+    nominal = times(C, recording.goals) + d
     vertices = {kind: estimate.feasible_set.vertices() for kind, estimate in sets.items()}
     for i, robot in enumerate(recording.robots):
         yield {
@@ -52,15 +55,9 @@ def _regions(recording: Recording, measurement: Measurement, sets: dict[str, Set
             "nominal": nominal[i].tolist(),
             "active": [recording.row_names[j] for j in active[i].nonzero().flatten().tolist()],
             "rows": torch.cat([rows.A[i], rows.b[i].unsqueeze(-1)], dim=-1)[real[i]].tolist(),
-            **{kind: _distinct(of_kind[i]).tolist() for kind, of_kind in vertices.items()},
+            **{kind: _vertices(of_kind[i]) for kind, of_kind in vertices.items()},
         }
 
 
-def _distinct(vertices: Tensor) -> Tensor:
-    """The vertices without padding, which repeats the first vertex. An empty set has none."""
-    vertices = vertices[vertices.isfinite().all(-1)]
-    if len(vertices) == 0:
-        return vertices
-    padding = (vertices == vertices[0]).all(-1)
-    padding[0] = False
-    return vertices[~padding]
+def _vertices(padded: Float[Tensor, "V 2"]) -> list[list[float]]:
+    return without_repeats(padded).tolist() if padded.isfinite().all() else []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -10,9 +11,24 @@ from experiments.runs.config import ExperimentConfig
 from experiments.runs.recording import Recording
 from experiments.runs.saved import SETS
 from experiments.runs.tally import SetTally, Tally
+from torchfsid.identification.evidence import SetKind
 from torchfsid.observers.hybrid import HybridEstimate, HybridObserver
 from torchfsid.observers.set_membership import SetEstimate, SetMembershipObserver
+from torchfsid.robots.barriers import Barrier
 from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.tasks import Task
+
+
+def build_sets(
+    config: ExperimentConfig, kind: SetKind, task: Task, barriers: Sequence[Barrier], robots: int
+) -> SetMembershipObserver:
+    """The observer of one kind of set.
+
+    The critical region uses the active tolerance as its only bound, also to decide on alarms.
+    """
+    noise = config.noise.build() if kind == "inverse_optimal" else None
+    prior, tolerance = config.prior.build(robots), config.active_tolerance
+    return SetMembershipObserver(task, barriers, prior, kind=kind, noise=noise, active_tolerance=tolerance)
 
 
 @dataclass
@@ -20,8 +36,6 @@ class Observers:
     """The observers of a recording.
 
     Attributes:
-        config: the configuration.
-        recording: the recording.
         sets: one observer per kind of set. The first is the configuration's `set`.
         hybrid: combines the first set with the filter.
         tally: the counts so far.
@@ -37,7 +51,7 @@ class Observers:
         config, recording = self.config, self.recording
         task, barriers, robots = recording.task, recording.barriers, len(recording.robots)
         kinds = sorted(SETS, key=lambda kind: kind != config.set)
-        self.sets = {kind: config.build_sets(kind, task, barriers, robots) for kind in kinds}
+        self.sets = {kind: build_sets(config, kind, task, barriers, robots) for kind in kinds}
         ukf = config.ukf.build(task, barriers, config.prior, robots, config.active_tolerance)
         self.hybrid = HybridObserver(self.sets[config.set], ukf, feedback=config.ukf.feedback)
         volumes = {kind: SetTally(of.feasible_set.volume()) for kind, of in self.sets.items()}

@@ -43,15 +43,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class SimulatedScene:
-    """A scene that was run.
-
-    Attributes:
-        config: the configuration.
-        task: the task.
-        barriers: the barriers.
-        true: the true trajectory.
-        measured: the trajectory with errors of measurement.
-    """
+    """A scene that was run: its true trajectory, and the one measured with errors."""
 
     config: SceneConfig
     task: Task

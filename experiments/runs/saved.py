@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from experiments.results import Columns, read_columns, read_json, read_lines, reading, require_length
+from experiments.results import Columns, read_columns, read_json, reading, require_length
 from experiments.runs.config import CasesConfig, SceneConfig
 
 SETS: tuple[Literal["critical_region", "inverse_optimal"], ...] = ("critical_region", "inverse_optimal")
@@ -36,12 +37,7 @@ class Region:
 
 @dataclass(frozen=True)
 class Results:
-    """The folder of a run. Robots have the order of the configuration, and times increase.
-
-    Attributes:
-        folder: the folder.
-        config: its configuration.
-    """
+    """The folder of a run. Robots have the order of the configuration, and times increase."""
 
     folder: Path
     config: SceneConfig | CasesConfig
@@ -94,8 +90,8 @@ class Results:
     def regions(self) -> list[list[Region]]:
         """The regions by sample, then robot."""
         path, count = self.folder / "regions.jsonl", len(self.robots)
-        with reading(path):
-            lines = [_region(line) for line in read_lines(path)]
+        with reading(path), path.open(encoding="utf-8") as file:
+            lines = [_region(json.loads(line)) for line in file]
         require_length(path, len(lines), count * len(self.t))
         return [lines[i : i + count] for i in range(0, len(lines), count)]
 

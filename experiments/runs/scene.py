@@ -22,7 +22,7 @@ def run_scene(config: SceneConfig, out: Path, track: Track) -> dict[str, Any]:
     write_trajectory(out / "trajectory.csv", config.bodies, scene.measured)
     observers = Observers(config, scene.recording())
     observe(observers, out, track)
-    return summarise_scene(Results(out, config), observers, scene.true)
+    return summarise_scene(config, Results(out, config), observers.tally, scene.true)
 
 
 def write_trajectory(path: Path, bodies: list[str], measured: Trajectory) -> None:

@@ -10,27 +10,28 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from experiments.runs.config import ExpectedConfig, ExperimentConfig, SceneConfig
 from experiments.runs.lengths import lengths, prior_lengths
-from experiments.runs.observers import Observers
 from experiments.runs.saved import Results
+from experiments.runs.tally import Tally
 from torchfsid.robots.simulation import Trajectory
 
 SHARES = (0.1, 0.01)
 
 
-def summarise_scene(results: Results, observers: Observers, true: Trajectory) -> dict[str, Any]:
+def summarise_scene(config: SceneConfig, results: Results, tally: Tally, true: Trajectory) -> dict[str, Any]:
     """The content of summary.json."""
-    config, tally = observers.config, observers.tally
-    assert isinstance(config, SceneConfig)
     active = {robot: [at[i].active for at in results.regions] for i, robot in enumerate(results.robots)}
-    measures = lengths(results)
-    prior = prior_lengths(results)
-    infeasible, deadlock = (~true.feasible).sum(0).tolist(), true.deadlocked_since.tolist()
+    measures, before = lengths(results), prior_lengths(results)
 
-    def per_robot(values: Sequence[Any]) -> dict[str, Any]:
-        return dict(zip(results.robots, values, strict=True))
+    def per_robot(values: list | np.ndarray | Tensor) -> dict[str, Any]:
+        return dict(zip(results.robots, values if isinstance(values, list) else values.tolist(), strict=True))
+
+    def until_below(name: str, share: float) -> list[float | None]:
+        of_robots = zip(measures[name].T, share * before[name], strict=True)
+        return [stays_below(results.t, values, bound) for values, bound in of_robots]
 
     summary: dict[str, Any] = {
         "title": config.title,
@@ -42,42 +43,29 @@ def summarise_scene(results: Results, observers: Observers, true: Trajectory) ->
         summary["expected_timeline"] = compare(results.t, active[results.robots[0]], config.expected, config.dt)
     return summary | {
         "steps": tally.samples,
-        "truth_outside": {kind: per_robot(of.outside.tolist()) for kind, of in tally.sets.items()},
-        "area_grew": {kind: per_robot(of.grew.tolist()) for kind, of in tally.sets.items()},
-        "ukf_outside": {kind: per_robot(of.ukf_outside.tolist()) for kind, of in tally.sets.items()},
-        "before": {name: per_robot(values.tolist()) for name, values in prior.items()},
+        "truth_outside": {kind: per_robot(of.outside) for kind, of in tally.sets.items()},
+        "area_grew": {kind: per_robot(of.grew) for kind, of in tally.sets.items()},
+        "ukf_outside": {kind: per_robot(of.ukf_outside) for kind, of in tally.sets.items()},
+        "before": {name: per_robot(values) for name, values in before.items()},
         "at_snapshots": [
-            {
-                "t": float(results.t[k]),
-                **{name: per_robot(values[k].tolist()) for name, values in measures.items()},
-            }
+            {"t": float(results.t[k]), **{name: per_robot(values[k]) for name, values in measures.items()}}
             for k in map(results.at, config.snapshots)
         ],
         "time_below": {
-            f"{share:.0%}": {
-                name: per_robot(
-                    [
-                        stays_below(results.t, of, share * before)
-                        for of, before in zip(values.T, prior[name], strict=True)
-                    ]
-                )
-                for name, values in measures.items()
-            }
-            for share in SHARES
+            f"{share:.0%}": {name: per_robot(until_below(name, share)) for name in measures} for share in SHARES
         },
-        "infeasible_steps": per_robot(infeasible),
-        "deadlocked_since": per_robot([None if math.isnan(t) else t for t in deadlock]),
+        "infeasible_steps": per_robot((~true.feasible).sum(0)),
+        "deadlocked_since": per_robot([None if math.isnan(t) else t for t in true.deadlocked_since.tolist()]),
     }
 
 
 def settings(config: ExperimentConfig) -> dict[str, Any]:
     """The settings on which every comparison depends."""
-    lower, upper = np.array(config.prior.lower), np.array(config.prior.upper)
-    spread = config.ukf.prior_std or ((upper - lower) / math.sqrt(12)).tolist()
+    spread = config.ukf.prior_std or config.ukf.spread(config.prior)
     return {
         "dt": config.dt,
         "set": config.set,
-        "prior": {"lower": list(config.prior.lower), "upper": list(config.prior.upper)},
+        "prior": config.prior.model_dump(),
         "noise_bound": config.noise.velocity,
         "ukf": {"R": config.ukf.position_noise**2, "Q_per_second": config.ukf.process_noise**2, "prior_std": spread},
     }

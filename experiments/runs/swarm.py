@@ -25,6 +25,7 @@ from experiments.kinds import Track
 from experiments.results import RowWriter
 from experiments.runs.config import SwarmConfig
 from experiments.runs.errors import in_disc
+from experiments.runs.observers import build_sets
 from torchfsid.commands.results import STATUS_NAMES, ResultsWriter
 from torchfsid.identification.kkt import CASES
 from torchfsid.observers.set_membership import SetEstimate
@@ -42,7 +43,7 @@ def run_swarm(config: SwarmConfig, out: Path, track: Track) -> dict[str, Any]:
     placing, measuring = map(np.random.default_rng, np.random.SeedSequence(config.seed).spawn(2))
     starts, goals = place(config, placing)
     controller = CbfQpController(config.task.build([]), [barrier.build([]) for barrier in config.barriers])
-    observer = config.build_sets(config.set, controller.task, controller.barriers, config.robots)
+    observer = build_sets(config, config.set, controller.task, controller.barriers, config.robots)
     lost, infeasible, closest = torch.zeros(config.robots, dtype=torch.bool), 0, float("inf")
     shown = {round(t / config.dt) for t in config.snapshots}
     loop, total = measurements(config, controller, starts, goals, measuring), config.steps + 1
@@ -116,10 +117,9 @@ def memory_mib() -> float:
 
 def _snapshot(measurement: Measurement, estimate: SetEstimate, size: Tensor, goals: Tensor) -> Iterator[dict[str, Any]]:
     columns = "x", "y", "goal_x", "goal_y", "sqrt_area"
-    places = torch.cat([measurement.x, goals, size.unsqueeze(-1)], dim=-1).tolist()
-    for i, (place, case) in enumerate(zip(places, estimate.kkt.case.tolist(), strict=True)):
-        numbers = dict(zip(columns, place, strict=True))
-        yield _rounded({"t": measurement.t, "robot": i, **numbers, "case": CASES[case]})
+    numbers = torch.cat([measurement.x, goals, size.unsqueeze(-1)], dim=-1).tolist()
+    for i, (place, case) in enumerate(zip(numbers, estimate.kkt.case.tolist(), strict=True)):
+        yield _rounded({"t": measurement.t, "robot": i, **dict(zip(columns, place, strict=True)), "case": CASES[case]})
 
 
 def _rounded(row: dict[str, Any]) -> dict[str, Any]:

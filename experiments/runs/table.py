@@ -30,22 +30,19 @@ PAPER = {"A": ("yes", "yes"), "B": ("yes", "yes"), "C": ("yes", "yes"), "D": ("n
 """Table I: is point-wise, is region-based identification possible?"""
 
 
-def measure_cases(results: Results, observers: Observers) -> dict[str, Any]:
+def measure_cases(config: CasesConfig, results: Results, observers: Observers) -> dict[str, Any]:
     """The content of summary.json. Its `cases` are also the content of cases.csv."""
-    config = observers.config
-    assert isinstance(config, CasesConfig)
     return {
         "title": config.title,
         "settings": settings(config) | {"spin": config.spin, "goal": list(config.goal)},
         "steps": observers.tally.samples,
-        "cases": [_measure(i, results, observers) for i in range(len(config.cases))],
+        "cases": [_measure(i, config, results, observers) for i in range(len(config.cases))],
     }
 
 
-def _measure(i: int, results: Results, observers: Observers) -> dict[str, Any]:
-    config, tally = observers.config, observers.tally
-    assert isinstance(config, CasesConfig)
-    case, duration, gain = config.cases[i], config.dt * tally.samples, known(config.task.gain) or 0.0
+def _measure(i: int, config: CasesConfig, results: Results, observers: Observers) -> dict[str, Any]:
+    case, tally, gain = config.cases[i], observers.tally, known(config.task.gain) or 0.0
+    duration = config.dt * tally.samples
     information_rank = int(torch.linalg.matrix_rank(tally.information[i], atol=RANK_TOLERANCE * gain**2 * duration))
     error = results.error("ukf_0", "ukf_1")[:, i]
     prior_error = np.linalg.norm((np.array(config.prior.lower) + config.prior.upper) / 2 - config.goal)

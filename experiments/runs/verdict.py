@@ -9,17 +9,10 @@ from rich.markup import escape
 
 from experiments.tables import table
 
-ESTIMATORS = {
-    "ukf": "UKF error",
-    "hybrid": "hybrid error",
-    "critical_region sqrt_area": "paper's region √area",
-    "critical_region diameter": "paper's region diameter",
-    "critical_region centroid": "paper's region centroid",
-    "critical_region centre": "paper's region centre",
-    "inverse_optimal sqrt_area": "inverse-optimal √area",
-    "inverse_optimal diameter": "inverse-optimal diameter",
-    "inverse_optimal centroid": "inverse-optimal centroid",
-    "inverse_optimal centre": "inverse-optimal centre",
+ESTIMATORS = {"ukf": "UKF error", "hybrid": "hybrid error"} | {
+    f"{kind} {measure}": f"{name} {measure.replace('sqrt_', '√')}"
+    for kind, name in (("critical_region", "paper's region"), ("inverse_optimal", "inverse-optimal"))
+    for measure in ("sqrt_area", "diameter", "centroid", "centre")
 }
 
 

@@ -18,19 +18,16 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from experiments.runs.config import SceneConfig, Text, WholeNumber, require_increasing
+from experiments.runs.config import Count, SceneConfig, Text, WholeNumber, require_increasing
 from experiments.teams import TeamConfig
 from torchfsid.config.documents import Strict, apply_overrides, validate, wrong
-from torchfsid.config.quantities import NonNegative, Number
+from torchfsid.config.quantities import NonNegative, PlanarVector, require_interval
 from torchfsid.errors import ConfigError
 
 MAX_RUNS = 1_000_000
 """More is a slip of the pen in the grid."""
 
 FILLED_IN = ("title", "seed", "snapshots")
-
-Count = Annotated[int, Field(strict=True, ge=1)]
-FromTo = Annotated[tuple[Number, ...], Field(min_length=2, max_length=2)]
 
 
 class SweepConfig(Strict):
@@ -54,7 +51,7 @@ class SweepConfig(Strict):
     repeats: Count
     times: Annotated[tuple[NonNegative, ...], Field(min_length=1)]
     experiment: dict[str, Any]
-    draw: dict[str, FromTo] = Field(default_factory=dict)
+    draw: dict[str, PlanarVector] = Field(default_factory=dict)
     grid: dict[str, Annotated[list[Any], Field(min_length=1)]] = Field(default_factory=dict)
 
     @property
@@ -134,9 +131,8 @@ class SweepConfig(Strict):
         keys = [*itertools.chain(*map(_keys, self.grid)), *self.draw]
         if repeated := [key for i, key in enumerate(keys) if key in keys[:i]]:
             raise wrong(f"{repeated[0]} is varied twice", "grid, draw")
-        for key, (low, high) in self.draw.items():
-            if low > high:
-                raise wrong(f"expected the smaller number first, got {[low, high]}", f"draw.{key}")
+        for key, bounds in self.draw.items():
+            require_interval(f"draw.{key}", bounds)
         if taken := [key for key in FILLED_IN if key in self.experiment or key in keys]:
             raise wrong("the sweep fills it in", f"experiment.{taken[0]}")
         if "team" in self.experiment and (given := {"robots", "obstacles"} & self.experiment.keys()):

@@ -13,10 +13,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from experiments.results import rows_of
 from experiments.runs.config import SceneConfig
 from experiments.runs.observers import Observers
 from experiments.runs.recording import SimulatedScene, simulate_scene
 from experiments.runs.saved import SETS
+from torchfsid.commands.results import STATUS_NAMES
 from torchfsid.identification.active_set import active_set
 from torchfsid.identification.kkt import CASES, solve_kkt
 from torchfsid.observers.hybrid import HybridEstimate
@@ -51,9 +53,8 @@ def observed(scene: SceneConfig, times: tuple[float, ...]) -> dict[str, Any]:
             since[since.isnan() & (observers.tally.sets[kind].outside > 0)] = measurement.t
         of_robots, active = _true_cases(simulated, simulated.true.measurement(k))
         cases += torch.bincount(of_robots, minlength=len(CASES))
-        seen = active_set(
-            stack_barriers(recording.barriers, measurement), _control(measurement), scene.active_tolerance
-        )
+        rows = stack_barriers(recording.barriers, measurement)
+        seen = active_set(rows, _control(measurement), scene.active_tolerance)
         seen_right += int((seen == active).all(-1).sum())
         if k in kept or k == recording.samples - 1:
             sizes = _sizes(estimate, sets, recording.goals)
@@ -104,15 +105,12 @@ def _sizes(estimate: HybridEstimate, sets: dict[str, SetEstimate], goals: Tensor
 def _series(
     t: float, robots: list[str], sizes: dict[str, Tensor], sets: dict[str, SetEstimate], observers: Observers
 ) -> list[dict[str, Any]]:
-    columns: dict[str, list] = {"robot": robots}
+    columns: dict[str, list] = {"t": [_rounded(t)] * len(robots), "robot": robots}
     for kind in SETS:
         columns[f"{kind}_lost"] = (observers.tally.sets[kind].outside > 0).long().tolist()
-        columns[f"{kind}_status"] = [Status(of_robot).name.lower() for of_robot in sets[kind].status.tolist()]
+        columns[f"{kind}_status"] = [STATUS_NAMES[of_robot] for of_robot in sets[kind].status.tolist()]
     columns |= {name: [_rounded(value) for value in values.tolist()] for name, values in sizes.items()}
-    return [
-        {"t": _rounded(t), **dict(zip(columns, of_robot, strict=True))}
-        for of_robot in zip(*columns.values(), strict=True)
-    ]
+    return rows_of(columns)
 
 
 def _of_set(observers: Observers, kind: str, lost_since: Tensor) -> dict[str, Any]:

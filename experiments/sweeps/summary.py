@@ -23,12 +23,12 @@ QUANTILES = (0.1, 0.5, 0.9)
 def summarise_sweep(folder: Path, config: SweepConfig) -> dict[str, Any]:
     """The content of summary.json. Sizes are quantiles over the robots at the last of the sweep's times."""
     swept = Swept(folder, config)
-    levels = itertools.product(*(range(len(axis)) for axis in swept.config.axes))
+    levels = itertools.product(*(range(len(axis)) for axis in config.axes))
     return {
-        "title": swept.config.title,
+        "title": config.title,
         "runs": len(swept.runs["run"]),
         "failed": swept.failed,
-        "keys": [", ".join(map(short, swept.telling(axis))) for axis in range(len(swept.config.axes))],
+        "keys": [", ".join(map(short, swept.telling(axis))) for axis in range(len(config.axes))],
         "points": [_point(swept, at) for at in levels],
     }
 

@@ -22,13 +22,7 @@ from torchfsid.errors import FsidError, one_line
 def run_sweep(config: SweepConfig, out: Path, track: Track, team: Workers | None = None) -> dict[str, Any]:
     """Finish the sweep in the folder `out`, and return its summary.
 
-    After an interruption a second call goes on with the missing runs.
-
-    Args:
-        config: the sweep.
-        out: the folder.
-        track: shows progress.
-        team: the workers. None: this process does the work.
+    After an interruption a second call goes on with the missing runs. Without a `team` this process does the work.
     """
     with Journal(out / "records.jsonl") as journal, workers() as alone:
         missing = [run for run in range(config.runs) if run not in journal.records]

@@ -19,12 +19,7 @@ from torchfsid.errors import FigureError
 
 @dataclass(frozen=True)
 class Swept:
-    """The tables of a sweep, with the columns of `experiments.sweeps.record`. Failed runs are left out.
-
-    Attributes:
-        folder: the folder.
-        config: the sweep.
-    """
+    """The tables of a sweep, with the columns of `experiments.sweeps.record`. Failed runs are left out."""
 
     folder: Path
     config: SweepConfig

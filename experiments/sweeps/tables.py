@@ -18,21 +18,21 @@ def write_tables(out: Path, config: SweepConfig, records: list[dict[str, Any]]) 
     """Write runs, series and timings of the finished runs, each file whole or not at all."""
     if not records:
         return
-    varied = [_varied(config, record["run"]) for record in records]
-    runs = [
-        {"run": record["run"], "error": record["error"], **values, **record["row"]}
-        for record, values in zip(records, varied, strict=True)
-    ]
-    series = [{"run": record["run"], **row} for record in records for row in record["series"]]
-    for name, rows in (("runs", runs), ("series", series)):
+    tables = {
+        "runs": [
+            {"run": record["run"], "error": record["error"], **_varied(config, record["run"]), **record["row"]}
+            for record in records
+        ],
+        "series": [{"run": record["run"], **row} for record in records for row in record["series"]],
+        "timings": [{"run": record["run"], "seconds": record["seconds"]} for record in records],
+    }
+    for name, rows in tables.items():
         table = _table(rows)
         with whole(out / f"{name}.csv") as path:
             pyarrow.csv.write_csv(table, path)
-        with whole(out / f"{name}.parquet") as path:
-            pyarrow.parquet.write_table(table, path)
-    timings = _table([{"run": record["run"], "seconds": record["seconds"]} for record in records])
-    with whole(out / "timings.csv") as path:
-        pyarrow.csv.write_csv(timings, path)
+        if name != "timings":
+            with whole(out / f"{name}.parquet") as path:
+                pyarrow.parquet.write_table(table, path)
 
 
 def read_table(path: Path) -> Columns:
