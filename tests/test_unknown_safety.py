@@ -110,6 +110,7 @@ def test_a_robot_of_its_own_kind_is_named_and_does_not_silence_the_others(
         assert region["status"] == "ok"
         low, high = region["safety"]["gain"]
         assert low <= gain <= high
+        assert {facet["robot"] for facet in region["safety"]["facets"] if facet is not None} == {robot}
     printed = capsys.readouterr().out
     assert "the team has no safety parameters in common" in printed
     assert "without d the others can have the same parameters" in printed

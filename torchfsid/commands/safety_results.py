@@ -80,10 +80,9 @@ def safety(observer: SafetyObserver, robot: int, seen: Distances, robots: Sequen
     unknown, psi = observer.model.unknown, observer.safety.select(torch.tensor([robot]))
     facets, intervals = psi.facets(), unknown.intervals(psi)
     of_gain, of_distance = unknown.bounded_by_data(psi)
-    real = (facets.halfspaces.A[0] != 0).any(-1)
+    real, m, shared = (facets.halfspaces.A[0] != 0).any(-1), len(labels), observer.is_shared
     r = seen.points()
     band = unknown.approach_speed(psi, r)[0] if len(r) else torch.zeros(0, 2)
-    named = "safety_distance" if unknown.margin is None else "margin"
     entry: dict[str, Any] = {
         "A": facets.halfspaces.A[0][real].tolist(),
         "b": facets.halfspaces.b[0][real].tolist(),
@@ -96,11 +95,13 @@ def safety(observer: SafetyObserver, robot: int, seen: Distances, robots: Sequen
         "approach_speed": torch.cat([r.unsqueeze(-1), band], dim=-1).tolist(),
         "largest_speed": seen.fastest,
         "facets": [
-            None if source < 0 else _origin(time, source // len(labels), source % len(labels), robots, labels)
+            None
+            if source < 0
+            else _origin(time, source // m % len(robots) if shared else robot, source % m, robots, labels)
             for time, source in zip(facets.time[0][real].tolist(), facets.source[0][real].tolist(), strict=True)
         ],
     }
-    if named == "margin":
+    if unknown.margin is not None:
         entry["margin"] = intervals.distance[0].tolist()
         entry["bounded_by_data"]["margin"] = of_distance[0].tolist()
     return entry
@@ -116,8 +117,8 @@ def refutation(found: Refutation, robots: Sequence[str], labels: Sequence[str]) 
     }
 
 
-def _origin(time: float, item: int, row: int, robots: Sequence[str], labels: Sequence[str]) -> dict:
-    return {"time": time, "robot": robots[item % len(robots)], "row": labels[row]}
+def _origin(time: float, robot: int, row: int, robots: Sequence[str], labels: Sequence[str]) -> dict:
+    return {"time": time, "robot": robots[robot], "row": labels[row]}
 
 
 def without_repeats(vertices: Tensor) -> Tensor:

@@ -184,6 +184,25 @@ def evidence(
     return _read(model, _sample(model, theta, measurement.observed_only()), compiled)
 
 
+def by_robot(omega: Halfspaces, t: float | Tensor, robots: int) -> tuple[Halfspaces, float | Tensor]:
+    """The half-spaces of each robot's samples as one set of rows, and their times, for several samples concatenated.
+
+    Args:
+        omega: the half-spaces (samples * robots, R), sample by sample.
+        t: the times of the items [s].
+        robots: the number of robots.
+    """
+    if len(omega.b) == robots:
+        return omega, t.unsqueeze(-1) if isinstance(t, Tensor) and t.ndim > 0 else t
+
+    def gathered(items: Tensor) -> Tensor:
+        return items.unflatten(0, (-1, robots)).transpose(0, 1).flatten(1, 2)
+
+    source = None if omega.source is None else gathered(omega.source)
+    times = torch.as_tensor(t, dtype=torch.float64).expand(len(omega.b)).unsqueeze(-1).expand(-1, omega.rows)
+    return Halfspaces(gathered(omega.A), gathered(omega.b), source), gathered(times)
+
+
 def _read(model: ObservationModel, sample: _Sample, compiled: bool | None) -> Evidence:
     return (_compiled if _can_be_compiled(model, sample, compiled) else _in_torch)(model, sample)
 

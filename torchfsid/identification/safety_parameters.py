@@ -25,7 +25,7 @@ from torch import Tensor
 
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.identification.evidence import Evidence, ObservationModel, evidence
+from torchfsid.identification.evidence import Evidence, ObservationModel, by_robot, evidence
 from torchfsid.identification.inverse_optimal import per_row
 from torchfsid.outcome import Outcome
 from torchfsid.robots.avoidance_within import AvoidanceWithin, SafetyRows
@@ -180,7 +180,7 @@ class LearningModel:
         corners = possible.psi.vertices().detach()[possible.owner].repeat(len(measurement.x) // max(robots, 1), 1, 1)
         model = self.given(corners)
         found = evidence(model, possible.theta, measurement, compiled)
-        theta = possible.theta.intersect(*_by_robot(found.omega, measurement.t, robots))
+        theta = possible.theta.intersect(*by_robot(found.omega, measurement.t, robots))
 
         place = next(i for i, b in enumerate(self.barriers) if isinstance(b, UnknownAvoidance))
         within = model.barriers[place]
@@ -219,20 +219,6 @@ def _cuts(rows: SafetyRows, kept: Bool[Tensor, "items m"], must: Bool[Tensor, "i
     b, items = torch.cat([-rows.low[item, row], active.b]), torch.cat([item, active_item])
     source = items * m + first + torch.cat([row, active_row])
     return Cuts(Halfspaces(A, b, source), items, torch.arange(len(items), device=items.device) >= len(item))
-
-
-def _by_robot(omega: Halfspaces, t: float | Tensor, robots: int) -> tuple[Halfspaces, float | Tensor]:
-    """The half-spaces of each robot's samples as one set of rows, and their times."""
-    if len(omega.b) == robots:
-        return omega, t if not isinstance(t, Tensor) else t.unsqueeze(-1)
-    R = omega.rows
-
-    def gathered(items: Tensor) -> Tensor:
-        return items.unflatten(0, (-1, robots)).transpose(0, 1).flatten(1, 2)
-
-    source = None if omega.source is None else gathered(omega.source)
-    times = torch.as_tensor(t, dtype=torch.float64).expand(len(omega.b)).unsqueeze(-1).expand(-1, R)
-    return Halfspaces(gathered(omega.A), gathered(omega.b), source), gathered(times)
 
 
 def _must_be_active(

@@ -23,8 +23,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchfsid.halfspaces import Halfspaces
-from torchfsid.identification.evidence import Evidence, ObservationModel, evidence
+from torchfsid.identification.evidence import Evidence, ObservationModel, by_robot, evidence
 from torchfsid.identification.safety_parameters import LearningModel, Possible
 from torchfsid.robots.barriers import Barrier
 from torchfsid.robots.bounds import NoiseBound
@@ -134,7 +133,7 @@ class Consistency:
                 noise = self._noise(block.repeated(velocity))
                 if psi is None:
                     found = evidence(ObservationModel(self.task, self._known, noise=noise), theta, block.measurement)
-                    narrowed = theta.intersect(self._omega(found))
+                    narrowed = theta.intersect(*by_robot(found.omega, block.of_items, self.robots))
                 else:
                     own = Possible(theta, psi, torch.arange(self.robots))
                     read = LearningModel(self.task, self.barriers, noise).read(own, block.measurement)
@@ -187,11 +186,6 @@ class Consistency:
     def _noise(self, velocity: Float[Tensor, "items"]) -> NoiseBound:
         slack = None if self.slack is None else torch.full_like(velocity, self.slack)
         return NoiseBound(velocity, slack, self.position, self.neighbour_velocity)
-
-    def _omega(self, found: Evidence) -> Halfspaces:
-        """The half-spaces of each robot's samples as one set of rows."""
-        A, b = (self._by_robot(part).transpose(0, 1).flatten(1, 2) for part in (found.omega.A, found.omega.b))
-        return Halfspaces(A, b)
 
     def _meets(
         self, block: Block, sets: Fit, velocity: Float[Tensor, "items"]

@@ -16,10 +16,10 @@ from torch import Tensor
 from torchfsid.errors import InconsistentError
 from torchfsid.identification.safety_parameters import Cuts, LearningModel, Possible, Reading
 from torchfsid.observers.second_look import second_look
-from torchfsid.observers.set_membership import Event, OnInconsistent
+from torchfsid.observers.set_membership import Event, OnInconsistent, contradicting
 from torchfsid.outcome import Status
 from torchfsid.robots.measurement import Measurement
-from torchfsid.sets.feasible_set import Facets, FeasibleSet
+from torchfsid.sets.feasible_set import FeasibleSet
 
 SETTLED = 20
 """Samples of a robot after which a row that had to be active is believed, if robots may change their goals. A change is
@@ -141,12 +141,12 @@ class SafetySets:
         after = second_look(self.model, own, measurements, most)
         mine = torch.isin(torch.arange(self.robots), items)
         if bool(after.is_empty.any()):
-            against = _rows_of(after.psi.contradiction, 0) if after.psi.any_empty else ()
+            against = contradicting(after.psi, 0) if after.psi.any_empty else ()
             robot = None if self.is_shared else place
             unexplained = tuple(items[after.theta.is_empty].tolist())
             self.refutations.append(Refutation(t, robot, self._named(against, robot), unexplained))
             if robot is not None:
-                rows = _rows_of(after.theta.contradiction, 0) if after.theta.any_empty else ()
+                rows = contradicting(after.theta, 0) if after.theta.any_empty else ()
                 self.events.append(Event(t, robot, Status.INCONSISTENT, rows))
                 self.status = torch.where(mine, Status.INCONSISTENT, self.status)
                 if self.on_inconsistent == "raise":
@@ -197,8 +197,8 @@ class SafetySets:
     def _against(self, theta: FeasibleSet, psi: FeasibleSet, robot: int) -> tuple[tuple[float, int], ...]:
         """The rows that contradict each other in an empty Theta, or else in an empty Psi, as (time, source)."""
         if theta.is_empty[robot]:
-            return _rows_of(theta.contradiction, robot)
-        rows = _rows_of(psi.contradiction, int(self.possible.owner[robot]))
+            return contradicting(theta, robot)
+        rows = contradicting(psi, int(self.possible.owner[robot]))
         return tuple((time, row) for time, _, row in self._named(rows, robot))
 
     def _refute(self, t: float, lost: Bool[Tensor, "G"], theta: FeasibleSet, psi: FeasibleSet) -> None:
@@ -207,7 +207,7 @@ class SafetySets:
         for place in lost.nonzero().flatten().tolist():
             robot = None if self.is_shared else place
             if robot not in known:
-                against = _rows_of(psi.contradiction, place) if bool(psi.is_empty[place]) else ()
+                against = contradicting(psi, place) if bool(psi.is_empty[place]) else ()
                 unexplained = (theta.is_empty & (self.possible.owner == place)).nonzero().flatten()
                 self.refutations.append(Refutation(t, robot, self._named(against, robot), tuple(unexplained.tolist())))
 
@@ -222,8 +222,3 @@ class SafetySets:
             for time, source in rows
             if source >= 0
         )
-
-
-def _rows_of(against: Facets, place: int) -> tuple[tuple[float, int], ...]:
-    """The rows that contradict each other, as (time, source)."""
-    return tuple(zip(against.time[place].tolist(), against.source[place].tolist(), strict=True))

@@ -159,20 +159,21 @@ class SetMembershipObserver:
 
     def _report(self, t: float, alarmed: Tensor, slack: Tensor, narrowed: FeasibleSet) -> None:
         """Record what went wrong for the first time, and raise the statuses, or an exception if that is asked for."""
-        evidence = narrowed.contradiction
-
-        def contradicting(robot: int) -> tuple[tuple[float, int], ...]:
-            return tuple(zip(evidence.time[robot].tolist(), evidence.source[robot].tolist(), strict=True))
-
         for robot in (alarmed & (self.status < Status.ALARM)).nonzero().flatten().tolist():
             row = int(slack[robot].argmin())
             self.events.append(Event(t, robot, Status.ALARM, ((t, row),)))
         reset = self.on_inconsistent == "reset"
         for robot in (narrowed.is_empty & (self.status < Status.INCONSISTENT)).nonzero().flatten().tolist():
-            self.events.append(Event(t, robot, Status.INCONSISTENT, contradicting(robot), reset))
+            self.events.append(Event(t, robot, Status.INCONSISTENT, contradicting(narrowed, robot), reset))
         self.status = torch.where(alarmed, self.status.clamp(min=Status.ALARM), self.status)
         if not reset:
             self.status = torch.where(narrowed.is_empty, Status.INCONSISTENT, self.status)
         if self.on_inconsistent == "raise" and narrowed.any_empty:
             robot = int(narrowed.is_empty.int().argmax())
-            raise InconsistentError(robot, t, contradicting(robot))
+            raise InconsistentError(robot, t, contradicting(narrowed, robot))
+
+
+def contradicting(sets: FeasibleSet, item: int) -> tuple[tuple[float, int], ...]:
+    """The rows that contradict each other in an EMPTY item, as (time, source)."""
+    against = sets.contradiction
+    return tuple(zip(against.time[item].tolist(), against.source[item].tolist(), strict=True))
