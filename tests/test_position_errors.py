@@ -76,7 +76,8 @@ def test_row_errors_hold_at_the_corners_of_the_errors() -> None:
             there = torch.ones(count, 1, dtype=torch.bool)
             seen = Measurement(0.0, x, u, body, there, body_velocities=u_body.unsqueeze(1))
             exactly = torch.zeros(count, 1, dtype=torch.float64)
-            told = barrier.errors(seen, ErrorBounds(exactly[:, 0] + e_robot, exactly + e_body, exactly))
+            bounds = ErrorBounds.none(seen)._replace(position=exactly[:, 0] + e_robot, body_position=exactly + e_body)
+            told = barrier.errors(seen, bounds)
             true = replace(seen, x=x + e_robot * moves[:, 0], bodies=body + e_body * moves[:, 1:])
             measured, rows = barrier(seen).normalised(), barrier(true).normalised()
             cosine = (rows.A * measured.A).sum(-1).clamp(-1, 1)
@@ -102,8 +103,8 @@ def test_drift_bounds_what_position_errors_do_to_the_nominal_control(task: Task)
         return (C @ theta.unsqueeze(-1)).squeeze(-1) + d
 
     bound = 0.05
-    nothing = nobody[..., 0]
-    drift = task.drift(ErrorBounds(torch.full((500,), bound, dtype=torch.float64), nothing, nothing), theta.abs())
+    exact = ErrorBounds.none(Measurement(0.0, x, None, nobody, nobody[..., 0].bool()))
+    drift = task.drift(exact._replace(position=exact.position + bound), theta.abs())
     moved = nominal(x + bound * move / move.norm(dim=-1, keepdim=True)) - nominal(x)
     assert (moved.norm(dim=-1) <= drift + 1e-12).all()
 

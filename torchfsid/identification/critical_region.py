@@ -46,7 +46,7 @@ def region_of(
     sees_theta = dot(across, across) > RANK_TOLERANCE**2
     # C theta + d - u* = P (C theta + d - A_a^+ b_a) lies in the span of the active rows: normals across it do not
     # matter.
-    normals, generator = outward_normals(unit.A, kkt.active, CRITICAL_NORMALS)
+    normals, generator, _ = outward_normals(unit.A, kkt.active, CRITICAL_NORMALS)
     along = normals @ kkt.projector
     j = torch.arange(unit.rows, device=generator.device).expand(kkt.active.shape)
     motion = torch.cat([kkt.G, kkt.f.unsqueeze(-1)], dim=-1)

@@ -6,9 +6,14 @@ A sample is informative only if
     - the robot was observed, and its controller had a solution (`controller_failed`);
     - the model could be evaluated: no row, C or d is NaN or infinite;
     - the rows of bodies without a slot are provably inactive (`neighbours`);
+    - the controller cannot have taken the least violation of its rows instead of its task (`Barrier.relaxes`);
     - no hard row is violated by more than its bound. Otherwise model or bounds are wrong, and the sample is alarming;
     - every row that may be active has a known direction. It has none if a body is at the robot's own place, within the
       errors of positions.
+
+A controller that relaxes infeasible rows takes a control at which rows with the largest violation, the speed limit
+among them, hold each other: some positive combination of them is zero. So the sample says nothing of theta if the cone
+of the rows that may be active contains a line. If it contains none, no row of such a barrier may be violated.
 
 The measurements of a whole log can be concatenated into one batch. In the plane, where no gradient is needed, compiled
 code computes the same from the slacks on (`kernels.evidence`).
@@ -29,10 +34,10 @@ from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, array, dot, finite
 from torchfsid.identification.active_set import touched
 from torchfsid.identification.critical_region import region_of
-from torchfsid.identification.inverse_optimal import per_row, set_around, without_direction
+from torchfsid.identification.inverse_optimal import normals_of, per_row, set_around, without_direction
 from torchfsid.identification.kkt import KktSolution, solve_unit
 from torchfsid.kernels import evidence as kernel
-from torchfsid.robots.barriers import Barrier, controller_failed, row_errors
+from torchfsid.robots.barriers import Barrier, controller_failed, possible_rows, row_errors
 from torchfsid.robots.bounds import ErrorBounds, NoiseBound, RowErrors
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.neighbours import left_out_inactive
@@ -76,6 +81,8 @@ class ObservationModel:
             raise InputError("kind", "inverse_optimal, since the nominal control is clipped", self.kind)
         if self.kind == "critical_region" and getattr(self.task, "uncertain", False):
             raise InputError("kind", "inverse_optimal, since the task is not known exactly", self.kind)
+        if self.kind == "critical_region" and any(getattr(barrier, "uncertain", False) for barrier in self.barriers):
+            raise InputError("kind", "inverse_optimal, since some rows are not known exactly", self.kind)
         if not self.active_tolerance > 0:
             raise InputError("active_tolerance", "a positive speed [m/s]", self.active_tolerance)
 
@@ -89,6 +96,7 @@ class Evidence:
             `critical_region` or `inverse_optimal_set`.
         informative: whether the sample is used.
         alarmed: whether it is not used because a hard row is violated beyond its bound.
+        infeasible: whether it is not used because the controller may have found its rows infeasible and relaxed them.
         slack: the slack of every row at the measured control [m/s].
         excess: the violation of every row beyond its bound [m/s]; positive if it is violated.
         hard: the rows that no controller may violate.
@@ -99,6 +107,7 @@ class Evidence:
     omega: Halfspaces
     informative: Bool[Tensor, "B"]
     alarmed: Bool[Tensor, "B"]
+    infeasible: Bool[Tensor, "B"]
     slack: Float[Tensor, "B m"]
     excess: Float[Tensor, "B m"]
     hard: Bool[Tensor, "m"]
@@ -115,7 +124,7 @@ class Evidence:
         source = None if self.omega.source is None else self.omega.source[items]
         return Evidence(
             Halfspaces(self.omega.A[items], self.omega.b[items], source), self.informative[items],
-            self.alarmed[items], self.slack[items], self.excess[items], self.hard,
+            self.alarmed[items], self.infeasible[items], self.slack[items], self.excess[items], self.hard,
             lambda: self.kkt.select(items), lambda chosen, rows: self.omega_without(items[chosen], rows),
         )  # fmt: skip
 
@@ -127,6 +136,7 @@ class _Sample:
     Attributes:
         rows: the rows A u <= b.
         hard: the rows that no controller may violate.
+        relaxed: the rows of which the controller takes the least violation if they are infeasible.
         u: the measured control [m/s].
         C: of the nominal control C theta + d.
         d: of the nominal control C theta + d [m/s].
@@ -140,6 +150,7 @@ class _Sample:
 
     rows: Halfspaces
     hard: Bool[Tensor, "m"]
+    relaxed: Bool[Tensor, "m"]
     u: Float[Tensor, "B n"]
     C: Float[Tensor, "B n p"]
     d: Float[Tensor, "B n"]
@@ -155,8 +166,8 @@ class _Sample:
         k, m = torch.arange(len(items), device=items.device), self.rows.rows
         errors = self.row_errors
         return _Sample(
-            Halfspaces(self.rows.A[items], self.rows.b[items]), torch.zeros_like(self.hard), self.u[items],
-            self.C[items], self.d[items], self.usable[items],
+            Halfspaces(self.rows.A[items], self.rows.b[items]), torch.zeros_like(self.hard), self.relaxed,
+            self.u[items], self.C[items], self.d[items], self.usable[items],
             self.bound.expand(len(self.u), m)[items].index_put((k, rows), self.bound.new_tensor(-torch.inf)),
             self.ball.expand(len(self.u))[items], self.drift.expand(len(self.u))[items],
             None if errors is None else RowErrors(errors.angle[items], errors.slack[items]),
@@ -219,16 +230,20 @@ def _sample(model: ObservationModel, theta: FeasibleSet, measurement: Measuremen
     if measurement.x.ndim != 2 or len(theta.batch_shape) != 1 or items % max(robots, 1) != 0:
         expected = f"a batch of {tuple(theta.batch_shape)} robots, or several of them"
         raise InputError("measurement", expected, tuple(measurement.x.shape))
-    parts = [barrier(measurement) for barrier in model.barriers]
+    errors, of_rows, corners = ErrorBounds.of(measurement, model.noise), None, None
+    if errors is None and any(getattr(barrier, "uncertain", False) for barrier in model.barriers):
+        errors = ErrorBounds.of_controls(measurement, model.noise)
+    parts = [possible_rows(barrier, measurement, errors) for barrier in model.barriers]
     rows, (C, d) = Halfspaces.stack(parts), model.task(measurement)
-    soft = [b.soft for b, part in zip(model.barriers, parts, strict=True) for _ in range(part.rows)]
+    owners = [barrier for barrier, part in zip(model.barriers, parts, strict=True) for _ in range(part.rows)]
+    hard = torch.tensor([not barrier.soft for barrier in owners], dtype=torch.bool, device=u.device)
+    relaxed = torch.tensor([getattr(b, "relaxes", False) for b in owners], dtype=torch.bool, device=u.device)
 
     noise = NoiseBound(0.0, model.active_tolerance) if model.noise is None else model.noise
     bound, ball, drift = per_row(noise.slack, u), per_row(noise.velocity, u).squeeze(-1), u.new_zeros(())
     if measurement.velocity_error is not None:
         bound, ball = bound + measurement.velocity_error.unsqueeze(-1), ball + measurement.velocity_error
     largest = bound.squeeze(-1)  # slack of an active row whose position is exact
-    errors, of_rows, corners = ErrorBounds.of(measurement, model.noise), None, None
     uncertain = getattr(model.task, "uncertain", False)
     if errors is not None or model.task.saturation is not None or uncertain:
         corners = theta.vertices().repeat(items // max(robots, 1), 1, 1)
@@ -236,8 +251,6 @@ def _sample(model: ObservationModel, theta: FeasibleSet, measurement: Measuremen
             drift = model.task.drift(errors, corners.abs().amax(-2))
         if uncertain:
             drift = drift + model.task.uncertainty(measurement, corners)  # type: ignore[attr-defined]
-    if errors is None and any(getattr(barrier, "uncertain", False) for barrier in model.barriers):
-        errors = ErrorBounds.none(measurement)
     if errors is not None:
         of_rows = row_errors(model.barriers, parts, measurement, errors)
         bound = bound + of_rows.slack
@@ -252,8 +265,7 @@ def _sample(model: ObservationModel, theta: FeasibleSet, measurement: Measuremen
 
     turned = of_rows if of_rows is not None and bool((of_rows.angle > 0).any()) else None
     return _Sample(
-        rows, ~torch.tensor(soft, dtype=torch.bool, device=u.device), u, C.to(torch.float64), d.to(torch.float64),
-        usable, bound, ball, drift, turned, corners,
+        rows, hard, relaxed, u, C.to(torch.float64), d.to(torch.float64), usable, bound, ball, drift, turned, corners,
     )  # fmt: skip
 
 
@@ -268,22 +280,26 @@ def _in_torch(model: ObservationModel, sample: _Sample) -> Evidence:
     slack = unit.b - dot(unit.A, u.unsqueeze(-2))
     room = sample.bound + ROUND_OFF * (dot(unit.A.abs(), u.abs().unsqueeze(-2)) + unit.b.abs()).detach()
     excess, near = -slack - room, slack <= room
-    alarmed = usable & ((excess > 0) & sample.hard).any(-1)
-    informative = usable & ~alarmed
+    alarmed, infeasible = usable & ((excess > 0) & sample.hard).any(-1), torch.zeros_like(usable)
+    outward = None if model.kind == "critical_region" else normals_of(unit, near, sample.row_errors)
+    if outward is not None and bool(sample.relaxed.any()):
+        alarmed = alarmed | usable & outward.pointed & ((excess > 0) & sample.relaxed).any(-1)
+        infeasible = usable & ~alarmed & ~outward.pointed
+    informative = usable & ~alarmed & ~infeasible
     if sample.row_errors is not None:
         informative = informative & ~(near & without_direction(unit, sample.row_errors)).any(-1)
     solve = partial(solve_unit, unit, touched(unit, slack, model.active_tolerance), C, d)
-    if model.kind == "critical_region":
+    if outward is None:
         kkt = solve()
         omega, solve = region_of(unit, kkt, C, d), lambda: kkt
     else:
         omega = set_around(
-            unit, near, sample.row_errors, u, C, d, sample.ball, sample.drift,
+            outward, unit.rows, u, C, d, sample.ball, sample.drift,
             model.task.saturation, None if sample.corners is None else sample.corners @ C.mT + d.unsqueeze(-2),
         )  # fmt: skip
     omega = omega.where(informative.unsqueeze(-1))
     without = partial(_omega_without, model, sample)
-    return Evidence(omega, informative, alarmed, slack, excess, sample.hard, solve, without)
+    return Evidence(omega, informative, alarmed, infeasible, slack, excess, sample.hard, solve, without)
 
 
 def _can_be_compiled(model: ObservationModel, sample: _Sample, wanted: bool | None) -> bool:
@@ -305,13 +321,13 @@ def _can_be_compiled(model: ObservationModel, sample: _Sample, wanted: bool | No
 def _compiled(model: ObservationModel, sample: _Sample) -> Evidence:
     angles = sample.u[:, :0] if sample.row_errors is None else sample.row_errors.angle
     tensors = (
-        sample.rows.A, sample.rows.b, sample.hard, sample.C, sample.d, sample.u, sample.usable,
+        sample.rows.A, sample.rows.b, sample.hard, sample.relaxed, sample.C, sample.d, sample.u, sample.usable,
         torch.atleast_2d(sample.bound), angles, torch.atleast_1d(sample.ball + sample.drift),
     )  # fmt: skip
     paper = model.kind == "critical_region"
     rows, judged, kkt = kernel.evidence(*map(array, tensors), paper, model.active_tolerance)
-    informative, alarmed, slack, excess = map(torch.from_numpy, judged)
+    informative, alarmed, infeasible, slack, excess = map(torch.from_numpy, judged)
     solved = KktSolution(*map(torch.from_numpy, kkt))
     omega = Halfspaces(*map(torch.from_numpy, rows))
     without = partial(_omega_without, model, sample)
-    return Evidence(omega, informative, alarmed, slack, excess, sample.hard, lambda: solved, without)
+    return Evidence(omega, informative, alarmed, infeasible, slack, excess, sample.hard, lambda: solved, without)

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, dot
-from torchfsid.identification.kkt import outward_normals
+from torchfsid.identification.kkt import OutwardNormals, outward_normals
 from torchfsid.identification.saturation import unclipped
 from torchfsid.robots.bounds import NoiseBound, RowErrors
 from torchfsid.robots.tasks import Saturation
@@ -69,23 +69,16 @@ def inverse_optimal_set(
     bound = per_row(noise.slack, u) + (0.0 if row_errors is None else row_errors.slack)
     near = unit.slack(u) <= bound + unit.round_off(u)
     ball = per_row(noise.velocity, u).squeeze(-1)
-    return set_around(unit, near, row_errors, u, C, d, ball, per_row(drift, u).squeeze(-1), saturation, possible)
+    outward = normals_of(unit, near, row_errors)
+    return set_around(outward, unit.rows, u, C, d, ball, per_row(drift, u).squeeze(-1), saturation, possible)
 
 
-def set_around(
-    unit: Halfspaces,
-    near: Bool[Tensor, "*batch m"],
-    row_errors: RowErrors | None,
-    u: Float[Tensor, "*batch n"],
-    C: Float[Tensor, "*batch n p"],
-    d: Float[Tensor, "*batch n"],
-    ball: Float[Tensor, "*#batch"],
-    drift: Float[Tensor, "*#batch"],
-    saturation: Saturation | None,
-    possible: Float[Tensor, "*batch v n"] | None,
-) -> Halfspaces:
-    """`inverse_optimal_set` for unit rows, of which those marked by `near` may be active."""
-    m, generators = unit.rows, unit.A
+def normals_of(unit: Halfspaces, near: Bool[Tensor, "*batch m"], row_errors: RowErrors | None) -> OutwardNormals:
+    """The outward normals of the cone of the unit rows that may be active (`near`), turned by up to their errors.
+
+    The generators are the rows, several times if they are turned: generator g belongs to row g mod m.
+    """
+    generators = unit.A
     if row_errors is None:
         may_be_active = near & (generators != 0).any(-1)
     else:
@@ -96,9 +89,24 @@ def set_around(
         angle = torch.where(unknown, math.pi, row_errors.angle)
         generators = torch.cat([_turned(generators, fraction * angle) for fraction in SPREAD], dim=-2)
         may_be_active = torch.cat([may_be_active] * len(SPREAD), dim=-1)
+    outward = outward_normals(generators, may_be_active, NORMALS)
+    none = outward.generator == generators.shape[-2]
+    return outward._replace(generator=torch.where(none, unit.rows, outward.generator % max(unit.rows, 1)))
 
-    normals, generator = outward_normals(generators, may_be_active, NORMALS)
-    source = m + torch.where(generator < generators.shape[-2], generator % max(m, 1), m)
+
+def set_around(
+    outward: OutwardNormals,
+    m: int,
+    u: Float[Tensor, "*batch n"],
+    C: Float[Tensor, "*batch n p"],
+    d: Float[Tensor, "*batch n"],
+    ball: Float[Tensor, "*#batch"],
+    drift: Float[Tensor, "*#batch"],
+    saturation: Saturation | None,
+    possible: Float[Tensor, "*batch v n"] | None,
+) -> Halfspaces:
+    """`inverse_optimal_set`, given the outward normals of the cone of the m rows (`normals_of`)."""
+    normals, source = outward.normals, m + outward.generator
     needed = (normals != 0).any(-1)
     room = (ball + drift).unsqueeze(-1)
     if saturation is None:

@@ -172,10 +172,17 @@ def _principal_axes(A: Float[Tensor, "*batch m 2"]) -> tuple[Tensor, Tensor, Ten
 
 
 class OutwardNormals(NamedTuple):
-    """Unit outward normals of a cone, zero where not needed, and the generator nearest to each (m for none)."""
+    """Outward normals of a cone.
+
+    Attributes:
+        normals: unit vectors, zero where not needed.
+        generator: the generator nearest to each; m for none.
+        pointed: whether the cone contains no line, so that no positive combination of its generators is zero.
+    """
 
     normals: Float[Tensor, "*batch k 2"]
     generator: Int[Tensor, "*batch k"]
+    pointed: Bool[Tensor, "*batch"]
 
 
 def outward_normals(
@@ -215,7 +222,8 @@ def outward_normals(
     needed = torch.cat([inner, gaps.is_line], dim=-1)
     from_first, from_last, from_second = gaps.ends.unsqueeze(-1).unbind(-2)
     near = torch.cat([torch.where(step < 0.5, from_first, from_last), from_second], dim=-1)
-    return OutwardNormals(normals.masked_fill(~needed.unsqueeze(-1), 0.0), near.masked_fill(none, m))
+    pointed = (none | gaps.is_wide).squeeze(-1)
+    return OutwardNormals(normals.masked_fill(~needed.unsqueeze(-1), 0.0), near.masked_fill(none, m), pointed)
 
 
 class _Gaps(NamedTuple):

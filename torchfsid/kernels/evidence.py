@@ -36,14 +36,14 @@ def is_finite(k, C, d):
 
 @item
 @no_type_check
-def judge(k, A, b, hard, u, bound, angles, active_tolerance, unit, unit_b, slack, excess, active, near):
+def judge(k, A, b, hard, relaxed, u, bound, angles, active_tolerance, unit, unit_b, slack, excess, active, near):
     """Fill the unit rows, the slacks, the active rows and those that may be active (`near`).
 
     Returns:
-        Three answers: whether all rows are finite, whether a hard row is violated beyond its bound, and whether a row
-        that may be active has no known direction.
+        Four answers: whether all rows are finite, whether a hard row and whether a relaxed row is violated beyond its
+        bound, and whether a row that may be active has no known direction.
     """
-    known, broken, blind, least = True, False, False, bound.shape[1] - 1
+    known, broken, strained, blind, least = True, False, False, False, bound.shape[1] - 1
     of_bound, uncertain = min(k, len(bound) - 1), angles.shape[1] > 0
     for j in range(b.shape[1]):
         p, q, c = A[k, j, 0], A[k, j, 1], b[k, j]
@@ -65,10 +65,10 @@ def judge(k, A, b, hard, u, bound, angles, active_tolerance, unit, unit_b, slack
         slack[k, j], excess[k, j] = s, -s - room
         active[k, j] = is_row and abs(s) < active_tolerance
         near[j] = is_row and s <= room
-        broken = broken or (hard[j] and excess[k, j] > 0)
+        broken, strained = broken or (hard[j] and excess[k, j] > 0), strained or (relaxed[j] and excess[k, j] > 0)
         if uncertain and s <= room:
             blind = blind or angles[k, j] >= PI or (angles[k, j] > 0 and not is_row)
-    return known, broken, blind
+    return known, broken, strained, blind
 
 
 @item
@@ -144,13 +144,13 @@ def outward_normals(angle, order, K, none, around, normals, generator):
         generator: to be filled with the name of the generator nearest to each normal.
 
     Returns:
-        The number of normals.
+        The number of normals, and whether the cone is pointed.
     """
     fan = len(around)
     if K == 0:
         for i in range(fan - 1):
             normals[i, 0], normals[i, 1], generator[i] = around[i, 0], around[i, 1], none
-        return fan - 1
+        return fan - 1, True
     for i in range(1, K):
         a, g, j = angle[i], order[i], i - 1
         while j >= 0 and angle[j] > a:
@@ -181,7 +181,7 @@ def outward_normals(angle, order, K, none, around, normals, generator):
         direction = angle[second] + PI / 2
         normals[count, 0], normals[count, 1], generator[count] = math.cos(direction), math.sin(direction), order[second]
         count += 1
-    return count
+    return count, opening > ANGLE_TOLERANCE
 
 
 @item
@@ -244,13 +244,14 @@ def inverse_optimal(k, m, u, ball, C, d, normals, generator, count, none, row_A,
 
 @launcher
 @no_type_check
-def evidence(A, b, hard, C, d, u, usable, bound, angles, ball, paper, active_tolerance):
+def evidence(A, b, hard, relaxed, C, d, u, usable, bound, angles, ball, paper, active_tolerance):
     """What a measurement of B robots says about theta, and their KKT conditions.
 
     Args:
         A: (B, m, 2), the rows over the control.
         b: (B, m), their bounds [m/s].
         hard: (m,), the rows that no controller may violate.
+        relaxed: (m,), the rows of which the controller takes the least violation if they are infeasible.
         C: (B, 2, 2), of the nominal control C theta + d.
         d: (B, 2), of the nominal control [m/s].
         u: (B, 2), the measured controls [m/s].
@@ -262,8 +263,8 @@ def evidence(A, b, hard, C, d, u, usable, bound, angles, ball, paper, active_tol
         active_tolerance: the slack below which a row counts as active [m/s].
 
     Returns:
-        Half-spaces (A, b, source), padded. Then (informative, alarmed, slack, excess), as in `Evidence`. Then (G, f,
-        projector, free, offset, active, n_active, rank, case), as in `KktSolution`.
+        Half-spaces (A, b, source), padded. Then (informative, alarmed, infeasible, slack, excess), as in `Evidence`.
+        Then (G, f, projector, free, offset, active, n_active, rank, case), as in `KktSolution`.
     """
     B, m = b.shape
     fan = angles[:, :0] if paper else angles
@@ -271,7 +272,7 @@ def evidence(A, b, hard, C, d, u, usable, bound, angles, ball, paper, active_tol
     around = CRITICAL_DIRECTIONS if paper else DIRECTIONS
     R = (m if paper else 0) + len(around) + 1
     row_A, row_b, row_source = np.zeros((B, R, 2)), np.ones((B, R)), np.full((B, R), -1)
-    informative, alarmed = np.empty(B, np.bool_), np.empty(B, np.bool_)
+    informative, alarmed, infeasible = np.empty(B, np.bool_), np.empty(B, np.bool_), np.zeros(B, np.bool_)
     slack, excess = np.empty((B, m)), np.empty((B, m))
     G, f, projector, free = np.zeros((B, 2, 2)), np.zeros((B, 2)), np.zeros((B, 2, 2)), np.zeros((B, 2, 2))
     offset, active = np.zeros((B, 2)), np.empty((B, m), np.bool_)
@@ -279,9 +280,10 @@ def evidence(A, b, hard, C, d, u, usable, bound, angles, ball, paper, active_tol
     unit, unit_b, near = np.zeros((m, 2)), np.empty(m), np.empty(m, np.bool_)
     angle, order = np.empty(generators), np.empty(generators, np.int64)
     normals, generator = np.empty((len(around) + 1, 2)), np.empty(len(around) + 1, np.int64)
+    relaxes = relaxed.any()
     for k in range(B):
-        known, broken, blind = judge(
-            k, A, b, hard, u, bound, angles, active_tolerance, unit, unit_b, slack, excess, active, near
+        known, broken, strained, blind = judge(
+            k, A, b, hard, relaxed, u, bound, angles, active_tolerance, unit, unit_b, slack, excess, active, near
         )
         wish_known = is_finite(k, C, d)
         usable_here = usable[k] and known and wish_known
@@ -289,10 +291,16 @@ def evidence(A, b, hard, C, d, u, usable, bound, angles, ball, paper, active_tol
         K, rank[k] = solve_active(k, unit, unit_b, active, offset, projector)
         n_active[k], case[k] = K, K if K < 2 else 2 if rank[k] < 2 else 3 if K == 2 else 4
         solve_motion(k, C, d, wish_known, rank[k], offset, projector, free, G, f)
-        if not informative[k]:
+        if not (informative[k] or (relaxes and usable_here and not broken)):
             continue
         found = find_generators(k, unit, active[k] if paper else near, fan, angle, order)
-        count = outward_normals(angle, order, found, generators, around, normals, generator)
+        count, pointed = outward_normals(angle, order, found, generators, around, normals, generator)
+        if relaxes:
+            pointed = pointed and not blind
+            alarmed[k], infeasible[k] = strained and pointed, not pointed
+            informative[k] = informative[k] and pointed and not strained
+            if not informative[k]:
+                continue
         if paper:
             critical_region(
                 k, unit, unit_b, C, d, G, f, projector, offset, active, normals, generator, count,
@@ -303,6 +311,6 @@ def evidence(A, b, hard, C, d, u, usable, bound, angles, ball, paper, active_tol
             inverse_optimal(k, m, u, room, C, d, normals, generator, count, generators, row_A, row_b, row_source)
     return (
         (row_A, row_b, row_source),
-        (informative, alarmed, slack, excess),
+        (informative, alarmed, infeasible, slack, excess),
         (G, f, projector, free, offset, active, n_active, rank, case),
     )

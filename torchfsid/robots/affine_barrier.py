@@ -61,7 +61,7 @@ class AffineBarrier:
     def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
         if self.row_errors is not None:
             return self.row_errors(measurement, bounds)
-        if (callable(self.A) or callable(self.b)) and any(bool((bound > 0).any()) for bound in bounds):
+        if (callable(self.A) or callable(self.b)) and not bounds.exact:
             raise InputError("AffineBarrier.row_errors", "how far the rows may be off where bodies may be", None)
         return RowErrors.none(self(measurement).b)
 

@@ -34,6 +34,14 @@ class Barrier(Protocol):
                                     measured control [m/s], given `measurement.left_out`. It is infinite if bodies have
                                     no rows, and NaN or -inf if nothing is known. If missing, nothing is known.
 
+    Three more are for barriers that need them:
+
+        rows_within(measurement, bounds)  The rows that may exist, given bounds on the errors of the measurement, where
+                                    errors may decide which rows there are. Default: `barrier(measurement)`.
+        uncertain                   whether `errors` matter even if positions and other bodies' velocities are exact.
+        relaxes                     whether the controller, if no control keeps its rows, takes the control with the
+                                    least violation, whatever its task. Such a barrier is soft.
+
     Attributes:
         soft: the controller may violate the rows (it has slack variables), so that a violation is no alarm.
     """
@@ -55,6 +63,13 @@ class Barrier(Protocol):
 def stack_barriers(barriers: Sequence[Barrier], measurement: Measurement) -> Halfspaces:
     """The safe controls: the rows of all barriers, one below the other."""
     return Halfspaces.stack([barrier(measurement) for barrier in barriers])
+
+
+def possible_rows(barrier: Barrier, measurement: Measurement, bounds: ErrorBounds | None) -> Halfspaces:
+    """The rows of a barrier that may exist, given bounds on the errors of the measurement."""
+    if bounds is None or not hasattr(barrier, "rows_within"):
+        return barrier(measurement)
+    return barrier.rows_within(measurement, bounds)  # type: ignore[attr-defined]
 
 
 def is_joint(barriers: Sequence[Barrier]) -> bool:

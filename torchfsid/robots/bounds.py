@@ -1,6 +1,6 @@
 """The records of bounds on errors.
 
-NoiseBound    declared once for a whole log: errors of controls, slacks, positions, neighbours' velocities
+NoiseBound    declared once for a whole log: errors of controls, slacks, positions, velocities
 ErrorBounds   at one instant: the declared bounds plus those that the measurement itself gives
 RowErrors     errors of a barrier's rows that follow from errors of positions (`Barrier.errors`)
 """
@@ -24,11 +24,16 @@ from torchfsid.robots.measurement import Measurement
 class NoiseBound:
     """Bounds on measurement errors, the same at all times.
 
+    The control u of robots of first order is a velocity. That of robots of second order is an acceleration, and
+    `velocity` and `slack` are accelerations as well [m/s2].
+
     Attributes:
         velocity: a bound on |u - u*|, which counts errors of the measured control and of the controller's solver [m/s].
         slack: the largest measured slack of a truly active row [m/s]; default: `velocity`.
         position: a bound on the error of every measured position [m].
         neighbour_velocity: a bound on the errors of other bodies' velocities, where rows use them [m/s].
+        neighbour_acceleration: a bound on the errors of other bodies' accelerations, where rows use them [m/s2].
+        arrival: a bound on the errors of the robots' own `Measurement.velocity` [m/s].
 
     `velocity` and `slack` may be tensors (*batch,), a bound for each robot.
     """
@@ -37,6 +42,8 @@ class NoiseBound:
     slack: float | Float[Tensor, "*batch"]
     position: float
     neighbour_velocity: float
+    neighbour_acceleration: float
+    arrival: float
 
     def __init__(
         self,
@@ -44,9 +51,12 @@ class NoiseBound:
         slack: float | Float[Tensor, "*batch"] | None = None,
         position: float = 0.0,
         neighbour_velocity: float = 0.0,
+        neighbour_acceleration: float = 0.0,
+        arrival: float = 0.0,
     ):
         slack = velocity if slack is None else slack
         bounds = {"velocity": velocity, "slack": slack, "position": position, "neighbour_velocity": neighbour_velocity}
+        bounds |= {"neighbour_acceleration": neighbour_acceleration, "arrival": arrival}
         for name, bound in bounds.items():
             if not bool((torch.as_tensor(bound) >= 0).all()):
                 raise InputError(f"noise.{name}", "a bound >= 0", bound)
@@ -60,29 +70,54 @@ class ErrorBounds(NamedTuple):
         position: bound for the robots' positions [m].
         body_position: bound for the bodies' positions [m].
         body_velocity: bound for the bodies' velocities [m/s].
+        velocity: bound for the robots' velocities on arrival [m/s].
+        body_acceleration: bound for the bodies' accelerations [m/s2].
+        control: bound for the robots' controls, in their units.
     """
 
     position: Float[Tensor, "*batch"]
     body_position: Float[Tensor, "*batch m"]
     body_velocity: Float[Tensor, "*batch m"]
+    velocity: Float[Tensor, "*batch"]
+    body_acceleration: Float[Tensor, "*batch m"]
+    control: Float[Tensor, "*batch"]
 
     @classmethod
     def of(cls, measurement: Measurement, noise: NoiseBound | None) -> ErrorBounds | None:
-        """The declared bounds plus those of the measurement. None if positions and bodies' velocities are exact."""
-        position, velocity = (0.0, 0.0) if noise is None else (noise.position, noise.neighbour_velocity)
-        added = measurement.position_error, measurement.body_position_error, measurement.body_velocity_error
-        if position == velocity == 0 and all(error is None for error in added):
+        """The declared bounds plus those of the measurement. None if all but the controls is exact."""
+        noise, m = NoiseBound(0.0) if noise is None else noise, measurement
+        declared = noise.position, noise.position, noise.neighbour_velocity, noise.arrival, noise.neighbour_acceleration
+        added = (
+            m.position_error, m.body_position_error, m.body_velocity_error, m.arrival_error, m.body_acceleration_error,
+        )  # fmt: skip
+        if not any(declared) and all(error is None for error in added):
             return None
-        declared = (
-            bound + size for bound, size in zip(cls.none(measurement), (position, position, velocity), strict=True)
+        known = cls.of_controls(measurement, noise)
+        position, body_position, body_velocity, velocity, body_acceleration = (
+            bound + size if error is None else bound + size + error
+            for bound, size, error in zip(known[:-1], declared, added, strict=True)
         )
-        return cls(*(d if a is None else d + a for d, a in zip(declared, added, strict=True)))
+        return cls(position, body_position, body_velocity, velocity, body_acceleration, known.control)
+
+    @classmethod
+    def of_controls(cls, measurement: Measurement, noise: NoiseBound | None) -> ErrorBounds:
+        """The bounds where all but the controls is exact."""
+        none = cls.none(measurement)
+        control = none.control + (0.0 if noise is None else noise.velocity)
+        return none._replace(
+            control=control if measurement.velocity_error is None else control + measurement.velocity_error
+        )
 
     @classmethod
     def none(cls, measurement: Measurement) -> ErrorBounds:
         """The bounds of an exact measurement: zero."""
         robots, bodies = torch.zeros_like(measurement.x[..., 0]), torch.zeros_like(measurement.bodies[..., 0])
-        return cls(robots, bodies, bodies)
+        return cls(robots, bodies, bodies, robots, bodies, robots)
+
+    @property
+    def exact(self) -> bool:
+        """Is all but the controls exact?"""
+        return not any(bool((bound > 0).any()) for bound in self[:-1])
 
 
 class RowErrors(NamedTuple):

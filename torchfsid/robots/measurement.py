@@ -42,7 +42,8 @@ class Measurement:
     Attributes:
         t: time [s]; a tensor where the robots were measured at different times.
         x: positions [m].
-        u: velocities executed from t on, the robots' controls [m/s]; None before they are known (the forward model).
+        u: the robots' controls from t on; None before they are known (the forward model). Robots of first order are
+            driven by velocities [m/s], robots of second order by accelerations [m/s2].
         bodies: positions of the bodies that may have to be avoided [m].
         present: whether slot j holds a body that is present at t and is not the robot itself.
         body_velocities: the bodies' velocities at t [m/s]; NaN where unknown.
@@ -52,9 +53,14 @@ class Measurement:
         observed: whether the robot was measured at t; None if all were. Where False, x and u are not used.
         position_error: bounds on the error of `x` at this instant [m]; None for zero.
         body_position_error: bounds on the error of `bodies` [m]; None for zero.
-        velocity_error: bounds on the error of `u` [m/s]; None for zero.
+        velocity_error: bounds on the error of `u`, in its units; None for zero.
         body_velocity_error: bounds on the errors of the bodies' velocities [m/s]; None for zero.
         left_out: the bodies without a slot; None if all have one. A sample for which they could matter is not used.
+        velocity: velocities with which the robots arrive at t [m/s]: the state of robots of second order, and the
+            controls of one sample earlier of robots of first order. None if unknown.
+        body_accelerations: the bodies' accelerations from t on [m/s2], among robots of second order.
+        arrival_error: bounds on the error of `velocity` [m/s]; None for zero.
+        body_acceleration_error: bounds on the errors of `body_accelerations` [m/s2]; None for zero.
     """
 
     t: float | Float[Tensor, "*batch"]
@@ -72,6 +78,10 @@ class Measurement:
     velocity_error: Float[Tensor, "*batch"] | None = None
     body_velocity_error: Float[Tensor, "*batch m"] | None = None
     left_out: LeftOut | None = None
+    velocity: Float[Tensor, "*batch n"] | None = None
+    body_accelerations: Float[Tensor, "*batch m n"] | None = None
+    arrival_error: Float[Tensor, "*batch"] | None = None
+    body_acceleration_error: Float[Tensor, "*batch m"] | None = None
 
     @classmethod
     def of_team(
@@ -82,10 +92,12 @@ class Measurement:
         *,
         robots: Sequence[int] | None = None,
         previous_u: Float[Tensor, "bodies n"] | None = None,
+        acceleration: Float[Tensor, "bodies n"] | None = None,
         radius: Float[Tensor, "bodies"] | None = None,
         seen: Bool[Tensor, "bodies"] | None = None,
         position_error: Float[Tensor, "bodies"] | None = None,
         velocity_error: Float[Tensor, "bodies"] | None = None,
+        acceleration_error: Float[Tensor, "bodies"] | None = None,
     ) -> Measurement:
         """The batch of the inferred `robots` among all bodies of a team.
 
@@ -95,19 +107,25 @@ class Measurement:
             u: their velocities [m/s].
             robots: indices of the bodies that are inferred; default all.
             previous_u: velocities one sample earlier [m/s].
+            acceleration: accelerations from t on, the controls of robots of second order [m/s2]. Their `u` is a state.
             radius: radii of the bodies [m].
             seen: the bodies measured at t; default all. Others are no obstacles, and unobserved if they are robots.
             position_error: bounds on the errors of `x` [m].
             velocity_error: bounds on the errors of `u` and `previous_u` [m/s].
+            acceleration_error: bounds on the errors of `acceleration` [m/s2].
 
         Raises:
-            InputError: `x`, `u` are not (bodies, n).
+            InputError: `x`, `u`, `acceleration` are not (bodies, n), or there are accelerations without velocities.
         """
         x = torch.as_tensor(x).to(torch.float64)
         if x.ndim != 2:
             raise InputError("x", "positions (bodies, n)", tuple(x.shape))
         if u is not None and u.shape != x.shape:
             raise InputError("u", f"velocities of shape {tuple(x.shape)}", tuple(u.shape))
+        second_order = acceleration is not None
+        if second_order and (u is None or acceleration.shape != x.shape):
+            expected = f"accelerations of shape {tuple(x.shape)}, and velocities u"
+            raise InputError("acceleration", expected, tuple(acceleration.shape))
         count = x.shape[0]
         slot = torch.arange(count, device=x.device)
         index = slot if robots is None else slot[list(robots)]
@@ -124,18 +142,22 @@ class Measurement:
         return cls(
             t=t,
             x=x[index],
-            u=own(u),
+            u=own(acceleration if second_order else u),
             bodies=bodies,
             present=seen & (slot != index.unsqueeze(-1)),
+            velocity=own(u if second_order else previous_u),
             body_velocities=for_each_robot(u),
             previous_body_velocities=for_each_robot(previous_u),
+            body_accelerations=for_each_robot(acceleration),
             radius=own(radius),
             body_radii=for_each_robot(radius),
             observed=seen[index],
             position_error=own(position_error),
             body_position_error=for_each_robot(position_error),
-            velocity_error=own(velocity_error),
+            velocity_error=own(acceleration_error if second_order else velocity_error),
             body_velocity_error=for_each_robot(velocity_error),
+            arrival_error=own(velocity_error),
+            body_acceleration_error=for_each_robot(acceleration_error),
         )
 
     @property
@@ -168,7 +190,7 @@ class Measurement:
         """Several batches as one, one after the other. The time becomes a tensor.
 
         A field that only some parts have is filled in the others: no body left out, no error, all robots observed,
-        neighbours' velocities unknown (NaN).
+        velocities other than controls unknown (NaN).
 
         Raises:
             InputError: there are no parts, their numbers of slots differ, or only some have controls or radii.
@@ -219,6 +241,8 @@ def _unknown(name: str, part: Measurement) -> Tensor:
         return torch.ones_like(part.x[..., 0], dtype=torch.bool)
     if name.endswith("_error"):
         return torch.zeros_like(part.bodies[..., 0] if name.startswith("body") else part.x[..., 0])
+    if name == "velocity":
+        return torch.full_like(part.x, torch.nan)
     if name.endswith("body_velocities"):
         return torch.full_like(part.bodies, torch.nan)
     raise InputError(f"parts.{name}", "in all of the measurements or in none", "in some of them")

@@ -110,6 +110,7 @@ def nearest_bodies(
         u=own(u),
         bodies=x[slots],
         present=present,
+        velocity=own(previous_u),
         body_velocities=of_slots(u),
         previous_body_velocities=of_slots(previous_u),
         radius=own(radius),
@@ -119,6 +120,7 @@ def nearest_bodies(
         body_position_error=of_slots(position_error),
         velocity_error=own(velocity_error),
         body_velocity_error=of_slots(velocity_error),
+        arrival_error=own(velocity_error),
         left_out=left_out,
     )
 
