@@ -87,6 +87,10 @@ class Halfspaces:
         G, f = G.to(torch.float64), f.to(torch.float64)
         return Halfspaces(self.A @ G, self.b - (self.A @ f.unsqueeze(-1)).squeeze(-1), self.source)
 
+    def select(self, items: Int[Tensor, "k"]) -> Halfspaces:
+        """The items at these places of a batch (B,)."""
+        return Halfspaces(self.A[items], self.b[items], None if self.source is None else self.source[items])
+
     def where(self, keep: Bool[Tensor, "*batch m"]) -> Halfspaces:
         """Keep the rows marked by `keep`. The others become padding 0.z <= 1."""
         if bool(keep.all()):

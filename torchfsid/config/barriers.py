@@ -235,6 +235,83 @@ class ArenaConfig(_RobotsOwn):
         return Arena(self.lower, self.upper, self.class_k.build(), self.margin, self.soft)
 
 
+class SpeedDiscConfig(_RobotsOwn):
+    """`SpeedDisc`: |u| <= limit [m/s]."""
+
+    kind: Literal["speed_disc"] = "speed_disc"
+    limit: Positive
+    soft: Flag = False
+
+    def build(self, bodies: Sequence[str]) -> Barrier:
+        """The barrier. It does not depend on the bodies."""
+        from torchfsid.robots.speed_disc import SpeedDisc
+
+        return SpeedDisc(self.limit, self.soft)
+
+
+class NeighboursConfig(Strict):
+    """Which bodies an ORCA controller avoids: the `count` nearest ones nearer than `distance` [m]."""
+
+    count: Annotated[int, Field(strict=True, ge=1)]
+    distance: Positive
+
+
+class OrcaConfig(Strict):
+    """`Orca`. Radii are those of the log.
+
+    Attributes:
+        time_horizon: horizon of the controller [s].
+        time_step: its time step [s].
+        max_speed: its speed limit [m/s].
+        neighbours: the bodies that it avoids.
+        margin: distance that is added to the sum of two radii [m].
+        push_away: a neighbour nearer than the radii and this counts as being there [m].
+    """
+
+    kind: Literal["orca"] = "orca"
+    time_horizon: Positive
+    time_step: Positive
+    max_speed: Positive
+    neighbours: NeighboursConfig
+    margin: NonNegative = 0.0
+    push_away: NonNegative = 0.0
+    is_unknown: ClassVar[bool] = False
+
+    @property
+    def uses_radius(self) -> bool:
+        return True
+
+    @property
+    def neighbour_velocity(self) -> Literal["previous"]:
+        return "previous"
+
+    def require_radii(self, radius: Sequence[float] | None) -> None:
+        """Check that the log has the radii that the rows need [m].
+
+        Raises:
+            ConfigError: radii are missing, or are zero without a margin.
+        """
+        if radius is None:
+            raise ConfigError("barriers: orca needs the radii, but the log has none (column radius, bag.radius)")
+        if self.margin + min(radius) <= 0:
+            raise ConfigError("barriers: orca needs positive radii, or a margin")
+
+    def build(self, bodies: Sequence[str]) -> Barrier:
+        """The barrier. It does not depend on the bodies' names."""
+        from torchfsid.robots.orca import Orca
+
+        return Orca(
+            self.time_horizon,
+            self.time_step,
+            self.max_speed,
+            self.neighbours.count,
+            self.neighbours.distance,
+            self.margin,
+            self.push_away,
+        )
+
+
 BarrierConfig = Annotated[
-    AvoidanceConfig | SpeedBoxConfig | SpeedPolygonConfig | ArenaConfig, Field(discriminator="kind")
+    AvoidanceConfig | OrcaConfig | SpeedDiscConfig | SpeedBoxConfig | SpeedPolygonConfig | ArenaConfig,
+    Field(discriminator="kind"),
 ]

@@ -83,7 +83,9 @@ class NoiseConfig(_Errors):
         """The `NoiseBound` with these bounds."""
         from torchfsid.robots.bounds import NoiseBound
 
-        return NoiseBound(self.velocity, self.slack, self.position, self.neighbour_velocity)
+        return NoiseBound(
+            self.velocity, self.slack, self.position, self.neighbour_velocity, arrival=self.neighbour_velocity
+        )
 
 
 class ObservedNoiseConfig(_Errors):

@@ -153,7 +153,8 @@ class Log:
                 velocity_error=None if u_error is None else u_error[k],
             )
             if bodies_u_error is not None:
-                team = replace(team, body_velocity_error=bodies_u_error[k].expand_as(team.present))
+                errors = bodies_u_error[k]
+                team = replace(team, body_velocity_error=errors.expand_as(team.present), arrival_error=errors[robots])
             yield replace(team, observed=observes[k])
 
 

@@ -34,13 +34,15 @@ class Barrier(Protocol):
                                     measured control [m/s], given `measurement.left_out`. It is infinite if bodies have
                                     no rows, and NaN or -inf if nothing is known. If missing, nothing is known.
 
-    Three more are for barriers that need them:
+    Four more are for barriers that need them:
 
         rows_within(measurement, bounds)  The rows that may exist, given bounds on the errors of the measurement, where
                                     errors may decide which rows there are. Default: `barrier(measurement)`.
         uncertain                   whether `errors` matter even if positions and other bodies' velocities are exact.
         relaxes                     whether the controller, if no control keeps its rows, takes the control with the
                                     least violation, whatever its task. Such a barrier is soft.
+        speed_limit                 the radius of a disc that holds all controls [m/s]. Controllers keep it. Observers
+                                    see it as a row through the measured control (`speed_disc`).
 
     Attributes:
         soft: the controller may violate the rows (it has slack variables), so that a violation is no alarm.

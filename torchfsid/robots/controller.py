@@ -3,6 +3,9 @@ r"""The controller: the safety QP, and its control as a differentiable function 
     u* = argmin |u - uhat|^2  s.t.  A u <= b,      uhat = C theta + d                       (G., Eq. (5))
     uhat - u* = 1/2 sum_j mu_j a_j,   mu_j >= 0,   mu_j (a_j.u* - b_j) = 0                  (G., Eqs. (7)-(10))
 
+Some barriers limit the speed as well, |u| <= limit (`Barrier.speed_limit`), and some controllers take the control with
+the least violation where their rows are infeasible (`Barrier.relaxes`). See `speed_disc`.
+
 The control u* is the safe control nearest to uhat (`programmes.nearest_point`). It is exact. It is differentiable in
 theta, positions, gains and distances while the active set does not switch. At a switch the derivative is that of one
 side.
@@ -10,6 +13,7 @@ side.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -24,6 +28,7 @@ from torchfsid.outcome import ProgrammeStatus
 from torchfsid.programmes.differentiable import broadcast, nearest
 from torchfsid.robots.barriers import Barrier, is_joint
 from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.speed_disc import least_violation, nearest_in_disc
 from torchfsid.robots.tasks import Task
 
 
@@ -69,10 +74,10 @@ class Control:
     """The controls of a batch of robots.
 
     Attributes:
-        u: the control [m/s]; zero where infeasible.
+        u: the control [m/s]; where infeasible, zero or the control with the least violation (`Barrier.relaxes`).
         nominal: the nominal control uhat of the task [m/s].
         active: the rows with a positive multiplier (see `QpSolution`).
-        feasible: whether some control satisfies the rows.
+        feasible: whether some control satisfies the rows and the limit.
     """
 
     u: Float[Tensor, "*batch n"]
@@ -121,10 +126,35 @@ class CbfQpController:
         if measurement.body_velocities is None and is_joint(self.barriers):
             return self._team_control(measurement, uhat)
         safe_controls = Halfspaces.stack([barrier(measurement) for barrier in self.barriers])
-        return _control(safe_controls, uhat)
+        return self._within_limits(_control(safe_controls, uhat), safe_controls)
+
+    def _within_limits(self, control: Control, safe_controls: Halfspaces) -> Control:
+        """The control within the disc of the speed limit, or with the least violation of rows that are relaxed."""
+        limit, shape = min(getattr(barrier, "speed_limit", math.inf) for barrier in self.barriers), control.u.shape[:-1]
+        if limit == math.inf:
+            return control
+        rows = Halfspaces(
+            safe_controls.A.expand(*shape, -1, -1).reshape(-1, safe_controls.rows, 2),
+            safe_controls.b.expand(*shape, -1).reshape(-1, safe_controls.rows),
+        )
+        u, uhat, active = control.u.reshape(-1, 2), control.nominal.reshape(-1, 2), control.active.flatten(0, -2)
+        feasible = control.feasible.flatten()
+        outside = (feasible & (u.norm(dim=-1) > limit)).nonzero().flatten()
+        if len(outside):
+            of_circle, on, found = nearest_in_disc(rows.select(outside), uhat[outside], limit)
+            u, active = u.index_put((outside,), of_circle), active.index_put((outside,), on)
+            feasible = feasible.index_put((outside,), found)
+        relaxed = (~feasible & rows.A.isfinite().flatten(1).all(-1) & rows.b.isfinite().all(-1)).nonzero().flatten()
+        u = torch.where(feasible.unsqueeze(-1), u, 0.0)
+        if len(relaxed) and any(getattr(barrier, "relaxes", False) for barrier in self.barriers):
+            best, decide = least_violation(rows.select(relaxed), limit)
+            u, active = u.index_put((relaxed,), best), active.index_put((relaxed,), decide)
+        return Control(u.reshape(*shape, 2), control.nominal, active.reshape(*shape, -1), feasible.reshape(shape))
 
     def _team_control(self, measurement: Measurement, uhat: Tensor) -> Control:
         """One QP over the stacked controls. It holds the row a.u_i - a.u_j <= b of a pair (i, j) for i and for j."""
+        if any(hasattr(barrier, "speed_limit") for barrier in self.barriers):
+            raise InputError("barriers", "a speed polygon or box instead of a disc, for a joint QP", self.barriers)
         if uhat.ndim != 2 or uhat.shape != measurement.x.shape:
             raise InputError("measurement, theta", "one team (robots, n), for a joint QP", tuple(uhat.shape))
         if bool(measurement.present.diagonal().any()):

@@ -144,7 +144,8 @@ def left_out_inactive(
     """
     left_out = measurement.left_out
     assert left_out is not None
-    nearer = replace(measurement, left_out=left_out._replace(distance=left_out.distance - error))
+    # Twice the error, since the other bodies, to which a barrier may compare them, may be that much further.
+    nearer = replace(measurement, left_out=left_out._replace(distance=left_out.distance - 2 * error))
     inactive = left_out.distance.isinf()  # no body is left out
     if bool(inactive.all()):
         return inactive
