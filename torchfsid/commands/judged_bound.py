@@ -20,8 +20,8 @@ from jaxtyping import Float
 
 USELESS = 1 / 3
 """Share above which a bound is useless: even the direction to the goal, asin(share), is then unknown by 20 degrees.
-With the factor of `auto`, right models of simulators' logs need up to 0.23; a wrong kind of controller or task, wrong or
-missing rows and shifted columns need 0.3 to 5 (docs/wrong_models.md)."""
+With the factor of `auto`, right models of simulators' logs need up to 0.23. Wrong kinds of controllers or tasks, wrong
+or missing rows, and shifted columns need 0.3 to 5 (docs/wrong_models.md)."""
 
 SUSPECTS = "a wrong kind of controller, barrier or task, a wrong gain or distance, or shifted columns"
 """What a bound that has to be so large suggests."""
