@@ -90,6 +90,7 @@ def test_each_robot_is_identified_by_refuting_the_others(
             "refuted_at": None,
             "evidence": [],
             "volume": region["volume"],
+            "bound_useless": False,
         }
         for name in set(NAMES) - {true_name}:
             refuted = verdicts[body][name]

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from torchfsid.commands.declared_log import AUTO_FACTOR
+from torchfsid.commands.judged_bound import JudgedBound
 from torchfsid.observers.consistency import Consistency
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.outcome import Status
@@ -206,6 +207,15 @@ def automatic(belief: Belief, samples: list[Measurement], goals: Tensor, neighbo
     return NoiseBound(AUTO_FACTOR * smallest.repeat_interleave(ROBOTS), neighbour_velocity=neighbour_velocity)
 
 
+def useless(samples: list[Measurement], noise: NoiseBound) -> int:
+    """The number of robots in runs whose bound is useless, see `JudgedBound`."""
+    controls = torch.stack([sample.u for sample in samples if sample.u is not None])
+    sizes = controls.norm(dim=-1).unflatten(1, (-1, ROBOTS)).transpose(0, 1).flatten(1)
+    bounds = torch.as_tensor(noise.velocity)[::ROBOTS].tolist()
+    judged = [JudgedBound.of(bound, run.numpy()) for bound, run in zip(bounds, sizes, strict=True)]
+    return ROBOTS * sum(of_run.is_useless for of_run in judged)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the study and print the table."""
     parser = argparse.ArgumentParser(prog="python -m experiments.studies.wrong_models")
@@ -215,6 +225,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     torch.set_num_threads(1)
     runs = {task: simulated(task, chosen.seeds) for task in (TASK, SATURATED)}
     heads = "model", "bound", "errors", "flagged", "ok, inside", "ok, outside", "strained", "away", "silent for"
+    heads = (*heads, "useless") if chosen.auto else heads
     print(f"| {' | '.join(heads)} |\n|{'---|' * len(heads)}")
     for belief in BELIEFS:
         trajectories, goals = runs[belief.run]
@@ -229,7 +240,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             found = ending(belief, samples, goals, declared)
             counts = f"{found.flagged} | {found.right} | {found.silent} | {found.strained} ({found.strained_silent})"
             away = f"{found.away:.2g}" if found.silent else ""
-            print(f"| {belief.name} | {label} | {errors:g} | {counts} | {away} | {found.delay:.3g} |", flush=True)
+            last = f"{found.delay:.3g} | {useless(samples, declared)}" if chosen.auto else f"{found.delay:.3g}"
+            print(f"| {belief.name} | {label} | {errors:g} | {counts} | {away} | {last} |", flush=True)
     return 0
 
 

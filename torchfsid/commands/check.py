@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from torchfsid.commands.check_safety import SafetyCheck, check_safety
 from torchfsid.commands.declared_log import AUTO_FACTOR, DeclaredLog
+from torchfsid.commands.judged_bound import SUSPECTS, JudgedBound
 from torchfsid.commands.results import constraint_name, seconds
 from torchfsid.observers.consistency import Consistency, Fit
 
@@ -85,6 +86,7 @@ class Check:
         declared: the velocity bound of the configuration, or the one that `auto` takes [m/s].
         is_auto: the configuration says `auto`.
         fastest: the largest speed in the log [m/s].
+        bound: the larger of the declared and the smallest bound, judged by the speeds seen.
         shifts: number of samples by which velocities are taken later, to the `smallest_bound` then [m/s]. It is
             infinite if it is not below that without a shift.
         safety: what the log says about gain and safety distance. None where that is not asked.
@@ -94,6 +96,7 @@ class Check:
     declared: float
     is_auto: bool
     fastest: float
+    bound: JudgedBound
     shifts: dict[int, float]
     safety: SafetyCheck | None
 
@@ -125,6 +128,8 @@ class Check:
             )
         else:
             lines.append("velocities and positions are aligned: no shift by 1 or 2 samples fits better")
+        if self.bound.is_useless and not self._unexplained:
+            lines.append(self.bound.warning(is_needed=self.bound.bound <= AUTO_FACTOR * self.smallest_bound))
         for name, faults in (
             ("unexplained samples", [fault for robot in self.robots for fault in robot.contradictions]),
             ("samples that violate a hard row", [f for robot in self.robots for f in robot.violations if not f.soft]),
@@ -138,16 +143,17 @@ class Check:
                 )
         return lines if self.safety is None else [*lines, self.safety.conclusion()]
 
+    @property
+    def _unexplained(self) -> list[str]:
+        return [robot.robot for robot in self.robots if math.isinf(robot.smallest_bound)]
+
     def _fit(self) -> str:
-        unexplained = [robot.robot for robot in self.robots if math.isinf(robot.smallest_bound)]
-        if unexplained:
+        if self._unexplained:
             return (
                 f"the log contradicts the declared model: no velocity bound up to {self.fastest:.3g} m/s, "
-                f"the largest speed, explains {', '.join(unexplained)}"
+                f"the largest speed, explains {', '.join(self._unexplained)}; suspect {SUSPECTS}"
             )
-        share = (
-            f"{100 * self.smallest_bound / self.fastest:.2g} % of the largest speed" if self.fastest else "no motion"
-        )
+        share = replace(self.bound, bound=self.smallest_bound).compared()
         line = f"the log is consistent with the declared model for velocity >= {self.smallest_bound:.3g} m/s ({share})"
         if self.is_auto:
             return f"{line}; auto takes {self.declared:.3g}"
@@ -166,6 +172,7 @@ class Check:
             "declared": self.declared,
             "auto": self.is_auto,
             "largest_speed": self.fastest,
+            "bound": {"judged": self.bound.bound, **self.bound.to_json()},
             "best_shift": self.best_shift,
             "shifts": {str(shift): _finite(bound) for shift, bound in sorted(self.shifts.items())},
             "conclusions": self.conclusions(),
@@ -197,6 +204,7 @@ def check(declared: DeclaredLog) -> Check:
     overall = float(enough.max())
     bound = declared.config.noise.velocity
     velocity = AUTO_FACTOR * overall if bound == "auto" else bound
+    judged = declared.judged(max(velocity, overall))
 
     shifts = {0: float(bounds.max())}
     for shift in SHIFTS:
@@ -225,7 +233,7 @@ def check(declared: DeclaredLog) -> Check:
                 violations=faults.violations(i),
             )
         )
-    return Check(tuple(robots), velocity, bound == "auto", fastest, shifts, check_safety(declared))
+    return Check(tuple(robots), velocity, bound == "auto", fastest, judged, shifts, check_safety(declared))
 
 
 class _Faults:

@@ -46,6 +46,7 @@ class SafetyCheck:
         with_gain: what it allows with the declared gain.
         with_distance: what it allows with the declared distance.
         pair: whether it allows both declared values.
+        is_useless: whether the velocity bound is, see `JudgedBound`.
     """
 
     what: str
@@ -55,6 +56,7 @@ class SafetyCheck:
     with_gain: Learned | None
     with_distance: Learned | None
     pair: bool
+    is_useless: bool
 
     @property
     def verdict(self) -> str:
@@ -69,6 +71,9 @@ class SafetyCheck:
 
     def conclusion(self) -> str:
         """The verdict as a sentence."""
+        return f"at a useless bound only: {self._said()}" if self.is_useless and self.free else self._said()
+
+    def _said(self) -> str:
         if self.free is None:
             is_interval = self.gain is None
             within, causes = ("of the declared intervals ", "they are wrong, ") if is_interval else ("", "")
@@ -140,19 +145,22 @@ def check_safety(declared: DeclaredLog) -> SafetyCheck | None:
     if config.noise.velocity == "auto":
         smallest = declared.smallest_bounds()
         if math.inf in smallest.values():
-            return SafetyCheck(what, gain, low, None, None, None, False)
+            return SafetyCheck(what, gain, low, None, None, None, False, True)
         declared = declared.with_velocity_bound(automatic_bound(smallest))
+    velocity = declared.config.noise.velocity
+    assert velocity != "auto"
+    is_useless = declared.judged(velocity).is_useless
 
     def learned(unknown: UnknownAvoidance) -> Learned | None:
         return _learned(_with_barrier(declared, places[0], unknown), unknown)
 
     free = learned(anything)
     if barrier.is_unknown:
-        return SafetyCheck(what, None, None, free, None, None, free is not None)
+        return SafetyCheck(what, None, None, free, None, None, free is not None, is_useless)
     with_gain = free and learned(_with(stated, stated.gain, around))
     with_distance = free and learned(_with(stated, wide, (low, high)))
     pair = with_gain is not None and with_distance is not None and learned(stated) is not None
-    return SafetyCheck(what, gain, low, free, with_gain, with_distance, pair)
+    return SafetyCheck(what, gain, low, free, with_gain, with_distance, pair, is_useless)
 
 
 def _with_barrier(declared: DeclaredLog, place: int, barrier: UnknownAvoidance) -> DeclaredLog:

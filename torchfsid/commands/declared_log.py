@@ -7,6 +7,9 @@ from collections.abc import Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
+from torchfsid.commands.judged_bound import SUSPECTS, JudgedBound
 from torchfsid.config.observe import ObserveConfig
 from torchfsid.errors import ConfigError
 from torchfsid.logs.gaps import bridged
@@ -116,6 +119,13 @@ class DeclaredLog:
         other.task = other.config.task.build(self.log.bodies)
         return other
 
+    def judged(self, bound: float) -> JudgedBound:
+        """A velocity bound [m/s], judged by the controls of the inferred robots."""
+        assert self.log.u is not None
+        of_robots = [self.log.bodies.index(robot) for robot in self.robots]
+        controls = self.log.u[:, of_robots][self.log.velocity_known[:, of_robots]]
+        return JudgedBound.of(bound, np.linalg.norm(controls, axis=-1))
+
     def smallest_bounds(self) -> dict[str, float]:
         """For each robot, the smallest velocity bound with which the model explains its motion [m/s].
 
@@ -138,6 +148,6 @@ def automatic_bound(smallest: Mapping[str, float]) -> float:
     if unexplained:
         raise ConfigError(
             f"noise.velocity: auto: no bound up to the largest speed in the log explains robot {unexplained[0]!r}; "
-            "the model is wrong (torchfsid check says where)"
+            f"the model is wrong (torchfsid check says where): suspect {SUSPECTS}"
         )
     return AUTO_FACTOR * max(smallest.values())

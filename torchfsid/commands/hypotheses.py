@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torchfsid.commands.declared_log import DeclaredLog, automatic_bound
+from torchfsid.commands.judged_bound import JudgedBound
 from torchfsid.commands.observe import Observation
 from torchfsid.commands.results import STATUS_NAMES, constraint_name
 from torchfsid.commands.results_folder import write_json
@@ -27,12 +28,14 @@ class HypothesisVerdict:
         refuted_at: when its set became empty [s], or None.
         evidence: times [s] and labels of the rows that contradict each other then. The time of the prior is None.
         volume: volume of its set at the end.
+        bound_useless: it is left only with a bound that leaves wrong models, too, see `JudgedBound`.
     """
 
     status: str
     refuted_at: float | None
     evidence: tuple[tuple[float | None, str], ...]
     volume: float
+    bound_useless: bool
 
     def to_json(self) -> dict:
         """The entry of `hypotheses.json`."""
@@ -72,6 +75,11 @@ class Hypotheses:
         """The bound in use [m/s]."""
         return next(iter(self.observations.values())).velocity_bound
 
+    @property
+    def bound(self) -> JudgedBound:
+        """The same, judged by the speeds seen."""
+        return next(iter(self.observations.values())).bound
+
     def write_verdicts(self, out: Path) -> None:
         """Write hypotheses.json: the verdict on each hypothesis for each robot."""
         verdicts = {
@@ -93,6 +101,7 @@ class Hypotheses:
                     refuted_at=float(events[0].t) if events else None,
                     evidence=tuple((_or_none(float(time)), constraint_name(source, labels)) for time, source in rows),
                     volume=volumes[i],
+                    bound_useless=observation.bound.is_useless and not events,
                 )
         return verdicts
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 
 from torchfsid.commands.declared_log import AUTO_FACTOR, DeclaredLog, automatic_bound
+from torchfsid.commands.judged_bound import JudgedBound
 from torchfsid.commands.results import STATUS_NAMES, ResultsWriter, constraint_name, of_sets, seconds
 from torchfsid.commands.task_gain import TaskGain, narrowed
 from torchfsid.config.observe import ObserveConfig
@@ -67,6 +68,7 @@ class Observation:
         sets: the observer of the sets.
         observer: `sets` alone, or combined with the filter if the configuration has one.
         smallest_bounds: with `velocity: auto`, each robot's smallest velocity bound that explains its motion [m/s].
+        bound: the velocity bound in use, judged by the speeds seen.
         task_gain: where the gain of the task is unknown, the gains that can explain the log.
 
     Raises:
@@ -78,6 +80,7 @@ class Observation:
     observer: SetObserver | HybridObserver = field(init=False)
     stated: ObserveConfig = field(init=False)
     smallest_bounds: dict[str, float] | None = field(init=False, default=None)
+    bound: JudgedBound = field(init=False)
     task_gain: TaskGain | None = field(init=False, default=None)
     _cases: dict[str, Counter[str]] = field(init=False)
 
@@ -86,6 +89,7 @@ class Observation:
             self.smallest_bounds = self.declared.smallest_bounds()
             self.declared = self.declared.with_velocity_bound(automatic_bound(self.smallest_bounds))
         self.stated = self.declared.config
+        self.bound = self.declared.judged(self.velocity_bound)
         if self.config.task.is_unknown:
             self.declared, self.task_gain = narrowed(self.declared)
         self._cases = {robot: Counter() for robot in self.robots}
@@ -144,7 +148,8 @@ class Observation:
             FsidError: no parameter explains a robot, and `on_inconsistent` is `raise`. It names robot and rows.
             OSError: a file could not be written. The log was still observed to its end.
         """
-        with ResultsWriter(out, self.robots, self.sets, labels=self.declared.row_labels) as results:
+        bound, labels = {"used": self.velocity_bound, **self.bound.to_json()}, self.declared.row_labels
+        with ResultsWriter(out, self.robots, self.sets, labels=labels, bound=bound) as results:
             for measurement in track(self.declared.measurements()):
                 try:
                     estimate = self.observer.update(measurement)

@@ -46,6 +46,7 @@ def observe_log(path: Path, models: Mapping[str, ObserveConfig], folder: Results
     folder.claim([*files, *also], dump_models({name: of.stated for name, of in of_each.items()}))
     if run.smallest_bounds is not None:
         found = {"smallest": run.smallest_bounds, "factor": AUTO_FACTOR, "used": run.velocity_bound}
+        found |= run.bound.to_json()
         write_json(folder.path / "velocity_bound.json", found)
     problems: list[OSError | FigureError] = []
     for name, observation in of_each.items():

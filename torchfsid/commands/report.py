@@ -11,6 +11,7 @@ from rich.markup import escape
 
 from torchfsid.commands.check import Check
 from torchfsid.commands.hypotheses import Hypotheses, HypothesisVerdict
+from torchfsid.commands.judged_bound import JudgedBound
 from torchfsid.commands.observe import Observation, Verdict
 from torchfsid.commands.results import seconds
 from torchfsid.commands.task_gain import TaskGain
@@ -31,6 +32,8 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
     verdicts.columns[-1].justify = "left"
     for verdict in observation.verdicts():
         since = verdict.no_information_since
+        shown = observation.bound.cell(verdict.status, observation.smallest_bounds is not None)
+        is_doubtful = verdict.status != "ok" or observation.bound.is_useless
         resets = "".join(f", reset at {seconds(t)}" for t in verdict.resets)
         verdicts.add_row(
             escape(verdict.robot),
@@ -42,14 +45,14 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
             _point(verdict.centre, verdict),
             _size(verdict.radius),
             "never" if since is None else seconds(since),
-            _status(verdict.status) + resets,
+            (_red(shown) if is_doubtful else shown) + resets,
         )
     console.print(verdicts)
     if observation.task_gain is not None:
         _print_task_gain(observation.task_gain, console)
     if isinstance(observation.sets, SafetyObserver):
         _print_safety(observation.sets, observation.robots, observation.declared.row_labels, console)
-    _print_bound(console, observation.smallest_bounds, observation.velocity_bound)
+    _print_bound(console, observation.smallest_bounds, observation.bound)
     if strained := observation.strained():
         console.print(
             f"More than half of noise.velocity, {observation.velocity_bound:g} m/s, is needed by "
@@ -109,8 +112,7 @@ def print_hypotheses(hypotheses: Hypotheses, out: Path, console: Console) -> Non
     names, found = list(hypotheses.observations), hypotheses.verdicts()
     cells = {robot: [_cell(of_robot.get(name)) for name in names] for robot, of_robot in found.items()}
     left = [
-        ", ".join(name for name in names if name in of_robot and of_robot[name].refuted_at is None)
-        or "[bold red]none[/]"
+        ", ".join(name for name in names if name in of_robot and of_robot[name].refuted_at is None) or _red("none")
         for of_robot in found.values()
     ]
     if len(names) <= MOST_COLUMNS:
@@ -134,7 +136,7 @@ def print_hypotheses(hypotheses: Hypotheses, out: Path, console: Console) -> Non
         explains_some = bool((sets.status < Status.INCONSISTENT).any())
         if isinstance(sets, SafetyObserver) and sets.team_is_refuted and explains_some:
             console.print(escape(f"{name}: the robots have no safety parameters in common, each has its own"))
-    _print_bound(console, hypotheses.smallest_bounds, hypotheses.velocity_bound)
+    _print_bound(console, hypotheses.smallest_bounds, hypotheses.bound)
     console.print(escape(f"Results: {out}/hypotheses.json, and a folder for each of {', '.join(names)}"))
 
 
@@ -144,8 +146,9 @@ def _cell(verdict: HypothesisVerdict | None) -> str:
         return "-"
     if verdict.refuted_at is not None:
         return f"refuted at {seconds(verdict.refuted_at)} by {' / '.join(_rows(verdict))}"
-    alarm = "" if verdict.status == "ok" else f", {_status(verdict.status)}"
-    return f"possible, volume {_size(verdict.volume)}{alarm}"
+    alarm = "" if verdict.status == "ok" else f", {_red(verdict.status)}"
+    bound = " (bound useless)" if verdict.bound_useless else ""
+    return f"possible{bound}, volume {_size(verdict.volume)}{alarm}"
 
 
 def print_check(found: Check, name: str, console: Console) -> None:
@@ -186,12 +189,17 @@ def print_check(found: Check, name: str, console: Console) -> None:
         console.print(f"- {escape(conclusion)}", soft_wrap=True)
 
 
-def _print_bound(console: Console, smallest: Mapping[str, float] | None, used: float) -> None:
+def _print_bound(console: Console, smallest: Mapping[str, float] | None, bound: JudgedBound) -> None:
+    """Print the bound that `auto` found, and a warning if the bound is useless, found or declared."""
     if smallest is not None:
         robot = max(smallest, key=lambda robot: smallest[robot])
-        console.print(
-            escape(f"noise.velocity: auto found {smallest[robot]:.3g} m/s (robot {robot}), takes {used:.3g} m/s")
-        )
+        found = f"noise.velocity: auto found {smallest[robot]:.3g} {bound.unit} (robot {robot})"
+        takes = f"takes {bound.bound:.3g} {bound.unit}"
+        console.print(escape(f"{found}, {takes}: {bound.compared()}"), soft_wrap=True)
+    if bound.is_useless:
+        more = "" if smallest is None else " (torchfsid check names rows and looks for shifts)"
+        warning = escape(bound.warning(is_needed=smallest is not None) + more)
+        console.print(f"{_red('Warning:')} {warning}", soft_wrap=True)
 
 
 def _rows(verdict: HypothesisVerdict) -> list[str]:
@@ -199,8 +207,8 @@ def _rows(verdict: HypothesisVerdict) -> list[str]:
     return [escape(row) for row in dict.fromkeys(row for _, row in verdict.evidence)]
 
 
-def _status(status: str) -> str:
-    return status if status == "ok" else f"[bold red]{status}[/]"
+def _red(text: str) -> str:
+    return f"[bold red]{text}[/]"
 
 
 def _size(value: float) -> str:

@@ -49,6 +49,7 @@ class ResultsWriter:
         observer: the observer whose final sets go to regions.json.
         others: further observers, by the prefix of their columns.
         labels: labels of the rows of the model.
+        bound: what regions.json says of the velocity bound.
     """
 
     def __init__(
@@ -58,9 +59,10 @@ class ResultsWriter:
         observer: SetObserver,
         others: Mapping[str, SetMembershipObserver] = MappingProxyType({}),
         labels: Sequence[str] = (),
+        bound: Mapping[str, object] = MappingProxyType({}),
     ):
         self.out, self.robots, self.observer, self.others = out, list(robots), observer, others
-        self._labels, self._seen = labels, Distances()
+        self._labels, self._seen, self._bound = labels, Distances(), bound
         self._safety = SafetyColumns(observer) if isinstance(observer, SafetyObserver) else None
         self._described = {name: _Descriptions() for name in ("", *others)}
         self._problem: OSError | None = None
@@ -80,7 +82,8 @@ class ResultsWriter:
         with uninterrupted():
             self._file.close()
             try:
-                write_json(self.out / "regions.json", regions(self.robots, self.observer, self._seen, self._labels))
+                found = regions(self.robots, self.observer, self._seen, self._labels)
+                write_json(self.out / "regions.json", found | ({"bound": dict(self._bound)} if self._bound else {}))
             except OSError as problem:
                 self._problem = self._problem or problem
         if self._problem is not None:
