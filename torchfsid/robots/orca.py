@@ -246,7 +246,7 @@ class Orca:
         ):
             own, room = _branch_errors(pairs, branch, u, e, eps, T, is_circle)
             between = torch.atan2(_det(rows.n, branch.n).abs(), dot(rows.n, branch.n))
-            room = room + (slack - dot(branch.n, u) + branch.low).clamp(min=0.0)
+            room = room + (slack - dot(branch.n, u) + branch.low).abs()
             worst = RowErrors(
                 torch.where(possible, torch.maximum(worst.angle, own + between), worst.angle),
                 torch.where(possible, torch.maximum(worst.slack, room), worst.slack),
