@@ -17,6 +17,7 @@ from torchfsid.tolerances import NORMALS
 CORNERS = torch.tensor([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]], dtype=torch.float64) / 2
 NORM, BOX = Saturation("norm", (0.5, 0.5)), Saturation("box", (0.5, 0.3))
 LAZY = Saturation("norm", (0.5, 0.5), dead_speed=0.05)
+CONSTANT = Saturation("norm", (0.5, 0.5), dead_speed=0.5)
 ONLY_LAZY = Saturation("norm", (float("inf"), float("inf")), dead_speed=0.05)
 
 
@@ -27,7 +28,10 @@ def ball(u: torch.Tensor, delta: float) -> Halfspaces:
     return Halfspaces(normals, (normals @ u.unsqueeze(-1)).squeeze(-1) + delta).where((normals != 0).any(-1))
 
 
-@pytest.mark.parametrize("saturation", [NORM, BOX, LAZY, ONLY_LAZY], ids=["norm", "box", "dead zone", "dead zone only"])
+CLIPS = {"norm": NORM, "box": BOX, "dead zone": LAZY, "dead zone only": ONLY_LAZY, "constant speed": CONSTANT}
+
+
+@pytest.mark.parametrize("saturation", CLIPS.values(), ids=CLIPS)
 def test_every_wish_is_inside(saturation: Saturation) -> None:
     """20 000 wishes, with up to three active rows, errors at their bound, and priors from narrow to wide."""
     generator = torch.Generator().manual_seed(1)

@@ -71,21 +71,46 @@ class _Task(Strict):
 
 
 class GoalConfig(_Task):
-    """`GoalTask`: go to a goal with a known gain.
+    """`GoalTask`: go to a goal with a known gain, or at a constant speed until it is reached.
+
+    The law `proportional` needs `gain`. The law `constant_speed`, uhat = speed (theta - x)/|theta - x| down to the
+    distance `tolerance`, needs these two. It is the gain speed/tolerance, clipped to `speed`, with a dead zone of the
+    size `tolerance`.
 
     Attributes:
+        law: `proportional` or `constant_speed`.
         gain: gain of the nominal control [1/s], a number or bounds [low, high]. `torchfsid observe` narrows the bounds.
         saturation: how the nominal control is clipped. Default: not at all.
         dead_zone: distance from the goal within which the nominal control is zero [m].
+        speed: the constant speed [m/s].
+        tolerance: distance from the goal at which the robot stops [m].
     """
 
     kind: Literal["goal"] = "goal"
-    gain: PositiveOrInterval
+    law: Literal["proportional", "constant_speed"] = "proportional"
+    gain: PositiveOrInterval | None = None
     saturation: SaturationConfig | None = None
     dead_zone: NonNegative = 0.0
+    speed: Positive | None = None
+    tolerance: Positive | None = None
+
+    @model_validator(mode="after")
+    def _has_what_its_law_needs(self) -> GoalConfig:
+        needed, foreign = ("gain",), ("speed", "tolerance")
+        if self.law == "constant_speed":
+            needed, foreign = ("speed", "tolerance"), ("gain", "saturation", "dead_zone")
+        for name in needed:
+            if getattr(self, name) is None:
+                raise wrong(f"required key is missing, for law '{self.law}'", name)
+        for name in foreign:
+            if getattr(self, name):
+                raise wrong(f"a task with law '{self.law}' has none", name)
+        return self
 
     @model_validator(mode="after")
     def _moves_at_all(self) -> GoalConfig:
+        if self.gain is None:
+            return self
         require_interval("gain", self.gain)
         if self.is_unknown and self.dead_zone > 0:
             raise wrong("expected a known gain with a dead_zone", "gain")
@@ -100,7 +125,7 @@ class GoalConfig(_Task):
 
     @property
     def is_clipped(self) -> bool:
-        return self.saturation is not None or self.dead_zone > 0
+        return self.saturation is not None or self.dead_zone > 0 or self.law == "constant_speed"
 
     @property
     def _limits(self) -> tuple[float, float]:
@@ -113,6 +138,10 @@ class GoalConfig(_Task):
         """The `GoalTask` with these values."""
         from torchfsid.robots.tasks import GoalTask, Saturation
 
+        if self.speed is not None and self.tolerance is not None:
+            saturation = Saturation("norm", (self.speed, self.speed), dead_speed=self.speed)
+            return GoalTask(self.speed / self.tolerance, saturation=saturation)
+        assert self.gain is not None
         low, high = as_interval(self.gain)
         gain, error = (low + high) / 2, (high - low) / 2
         if not self.is_clipped:

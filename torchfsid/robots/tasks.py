@@ -28,6 +28,8 @@ Affine = tuple[Float[Tensor, "*batch n p"], Float[Tensor, "*batch n"]]
 class Saturation:
     """The clipped nominal control uhat = clip(C theta + d), which is zero where |C theta + d| is below `dead_speed`.
 
+    With `dead_speed` equal to the limit of a norm, the robot goes at a constant speed until it stops.
+
     Attributes:
         shape: `norm` for |uhat| <= v, `box` for |uhat_i| <= v_i.
         limits: the v_i [m/s]. For `norm` both are v. Infinite if there is a dead zone only.
@@ -40,8 +42,8 @@ class Saturation:
     dead_speed: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (min(self.limits) > self.dead_speed >= 0):
-            raise InputError("saturation", "limits > dead_speed >= 0 [m/s]", (self.limits, self.dead_speed))
+        if not (min(self.limits) >= self.dead_speed >= 0 and min(self.limits) > 0):
+            raise InputError("saturation", "positive limits >= dead_speed >= 0 [m/s]", (self.limits, self.dead_speed))
         if self.shape == "norm" and self.limits[0] != self.limits[1]:
             raise InputError("saturation.limits", "one limit, twice, for a norm", self.limits)
 
