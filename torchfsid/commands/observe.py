@@ -35,6 +35,7 @@ class Verdict:
         robot: name of the robot.
         cases: number of samples used, by case.
         skipped: number of samples not used.
+        infeasible: number of those at which the controller may have relaxed infeasible rows.
         volume: volume of the set [units of theta, to the power p].
         diameter: diameter of the set.
         centroid: centroid of the set.
@@ -48,6 +49,7 @@ class Verdict:
     robot: str
     cases: dict[str, int]
     skipped: int
+    infeasible: int
     volume: float
     diameter: float
     centroid: tuple[float, ...]
@@ -189,6 +191,7 @@ class Observation:
                 robot=robot,
                 cases={case: self._cases[robot][case] for case in CASES},
                 skipped=int(self.sets.skipped[i]),
+                infeasible=int(self.sets.infeasible[i]),
                 volume=float(volume[i]),
                 diameter=float(diameter[i]),
                 centroid=tuple(centroid[i].tolist()),

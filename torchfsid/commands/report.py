@@ -30,7 +30,8 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
         f"{len(observation.log.t)} samples, set: {observation.config.set}", ["robot", "cases"], [*numbers, "status"]
     )
     verdicts.columns[-1].justify = "left"
-    for verdict in observation.verdicts():
+    found = observation.verdicts()
+    for verdict in found:
         since = verdict.no_information_since
         shown = observation.bound.cell(verdict.status, observation.smallest_bounds is not None)
         is_doubtful = verdict.status != "ok" or observation.bound.is_useless
@@ -48,6 +49,11 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
             (_red(shown) if is_doubtful else shown) + resets,
         )
     console.print(verdicts)
+    if infeasible := [f"{verdict.robot} {verdict.infeasible}" for verdict in found if verdict.infeasible]:
+        console.print(
+            f"Rows may have been infeasible, and the controller took the least violation (of {len(observation.log.t)} "
+            f"samples): {escape(', '.join(infeasible))}. These samples are not used."
+        )
     if observation.task_gain is not None:
         _print_task_gain(observation.task_gain, console)
     if isinstance(observation.sets, SafetyObserver):

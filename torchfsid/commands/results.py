@@ -217,6 +217,7 @@ def regions(
             "status": STATUS_NAMES[Status(int(observer.status[i]))],
             "last_cut": float(sets.last_cut[i]),
             "skipped": int(observer.skipped[i]),
+            "infeasible": int(observer.infeasible[i]),
             "facets": [
                 {"time": time, "source": source}
                 for time, source in zip(facets.time[i][real].tolist(), facets.source[i][real].tolist(), strict=True)

@@ -135,6 +135,11 @@ class SafetyObserver:
         return self._shown.skipped
 
     @property
+    def infeasible(self) -> Int[Tensor, "B"]:
+        """See `SetMembershipObserver`."""
+        return self._shown.infeasible
+
+    @property
     def events(self) -> list[Event]:
         """See `SetMembershipObserver`, for the sets that are shown."""
         return self._shown.events

@@ -56,6 +56,7 @@ class SafetySets:
         prior: the initial sets Theta.
         status: a `Status` per robot.
         skipped: the number of samples without information, per robot.
+        infeasible: see `SetMembershipObserver`.
         events: the first ALARM and INCONSISTENT of each robot, and the times at which sets were reset.
         refutations: of Psi.
     """
@@ -67,6 +68,7 @@ class SafetySets:
     prior: FeasibleSet = field(init=False)
     status: Int[Tensor, "B"] = field(init=False)
     skipped: Int[Tensor, "B"] = field(init=False)
+    infeasible: Int[Tensor, "B"] = field(init=False)
     events: list[Event] = field(init=False, default_factory=list)
     refutations: list[Refutation] = field(init=False, default_factory=list)
     _waiting: list[tuple[int, float, Cuts]] = field(init=False, default_factory=list)
@@ -75,7 +77,7 @@ class SafetySets:
     def __post_init__(self) -> None:
         self.prior = self.possible.theta
         self.status = torch.zeros_like(self.possible.owner)
-        self.skipped = torch.zeros_like(self.status)
+        self.skipped = self.infeasible = torch.zeros_like(self.status)
 
     @property
     def robots(self) -> int:
@@ -104,6 +106,7 @@ class SafetySets:
             theta, psi = self._report(t, read, psi)
         self.possible = replace(before, theta=theta, psi=psi)
         self.skipped = self.skipped + ~read.evidence.informative
+        self.infeasible = self.infeasible + read.evidence.infeasible
         return read
 
     def update_all(self, measurements: Sequence[Measurement]) -> None:
@@ -116,7 +119,9 @@ class SafetySets:
             psi = read.cuts.apply(before.psi, before.owner, together.t)
             if not (read.theta.any_empty or psi.any_empty or bool(read.evidence.alarmed.any())):
                 self.possible = replace(before, theta=read.theta, psi=psi)
-                self.skipped = self.skipped + (~read.evidence.informative).unflatten(0, (-1, self.robots)).sum(0)
+                unused, infeasible = ~read.evidence.informative, read.evidence.infeasible
+                self.skipped = self.skipped + unused.unflatten(0, (-1, self.robots)).sum(0)
+                self.infeasible = self.infeasible + infeasible.unflatten(0, (-1, self.robots)).sum(0)
                 return
         for measurement in measurements:
             self.update(measurement)

@@ -101,6 +101,7 @@ class SetMembershipObserver:
         prior: the initial sets.
         status: a `Status` per robot.
         skipped: the number of samples without information, per robot.
+        infeasible: the number of those at which its controller may have found its rows infeasible and relaxed them.
         events: the first ALARM and INCONSISTENT of each robot, and the times at which sets were reset.
 
     Raises:
@@ -120,6 +121,7 @@ class SetMembershipObserver:
     prior: FeasibleSet = field(init=False)
     status: Int[Tensor, "B"] = field(init=False)
     skipped: Int[Tensor, "B"] = field(init=False)
+    infeasible: Int[Tensor, "B"] = field(init=False)
     events: list[Event] = field(init=False, default_factory=list)
 
     def __post_init__(self) -> None:
@@ -132,7 +134,7 @@ class SetMembershipObserver:
             raise InputError("compiled", "None or False unless theta is planar and nothing is clipped", True)
         self.prior = self.feasible_set
         self.status = torch.zeros_like(self.feasible_set.outcome)
-        self.skipped = torch.zeros_like(self.status)
+        self.skipped = self.infeasible = torch.zeros_like(self.status)
 
     def update(self, measurement: Measurement) -> SetEstimate:
         """Take in one measurement of all robots.
@@ -151,6 +153,7 @@ class SetMembershipObserver:
             narrowed = narrowed.where(~narrowed.is_empty, self._instead())
         self.feasible_set = narrowed
         self.skipped = self.skipped + ~found.informative
+        self.infeasible = self.infeasible + found.infeasible
         return SetEstimate(t, self.feasible_set, found, informative, self.status)
 
     def _instead(self) -> FeasibleSet:
