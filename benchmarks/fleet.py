@@ -5,8 +5,8 @@ The whole observer update (rows from positions, active set, KKT conditions, half
 CPU time on one thread. The search of the neighbours is not part of the observer and is timed separately. Ten fleets of
 1000 robots give that size as many robots as the others.
 
-Further tables: the same robots among more or fewer neighbours; one robot, update by update; and a fleet over many
-steps, whose cost must not grow.
+Further tables: the same robots among more or fewer neighbours; robots whose nominal control is clipped; one robot,
+update by update; and a fleet over many steps, whose cost must not grow.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from benchmarks import save
-from benchmarks.scenario import NEIGHBOURS, Fleet, measured, observer
+from benchmarks.scenario import NEIGHBOURS, SHARES, Clip, Fleet, measured, observer
 
 SIZES, LEAST, BLOCK = (1_000, 10_000, 100_000), 10_000, 10
 CROWDS = (4, 8, 16, 32)
@@ -35,12 +35,20 @@ def _blocks(fleet: Fleet, steps: int) -> Iterator[list[tuple[float, Tensor, Tens
         yield block
 
 
-def run(robots: int, steps: int, noisy: bool, compiled: bool, fleets: int = 1, neighbours: int = NEIGHBOURS) -> dict:
+def run(
+    robots: int,
+    steps: int,
+    noisy: bool,
+    compiled: bool,
+    fleets: int = 1,
+    neighbours: int = NEIGHBOURS,
+    clip: Clip | None = None,
+) -> dict:
     """Observe some fleets from the prior on, one after the other. Times are per robot and update [us]."""
     spent, search, cut, used, active, lost = [], 0.0, 0, 0, 0, 0
     for seed in range(fleets):
-        fleet = Fleet(robots, noisy, seed)
-        watching = observer(fleet.prior(), compiled)
+        fleet = Fleet(robots, noisy, seed, clip)
+        watching = observer(fleet.prior(), compiled, fleet.task)
         for moments in _blocks(fleet, steps):
             began = time.process_time()
             block = [measured(*moment, neighbours=neighbours) for moment in moments]
@@ -61,6 +69,7 @@ def run(robots: int, steps: int, noisy: bool, compiled: bool, fleets: int = 1, n
         "fleets": fleets,
         "steps": steps,
         "noisy": noisy,
+        "clip": clip,
         "per_second": count / sum(spent),
         "microseconds": 1e6 * sum(spent) / count,
         "last_microseconds": 1e6 * float(np.median(late)) / robots,
@@ -118,8 +127,9 @@ def main(arguments: list[str]) -> None:
         sizes = [(robots, noisy) for noisy in (False, True) for robots in SIZES if robots <= options.largest]
         rows = [run(B, options.steps, noisy, compiled, max(1, LEAST // B)) for B, noisy in sizes]
         crowds = [run(1000, options.steps, True, compiled, LEAST // 1000, M) for M in CROWDS]
+        clips = [run(LEAST, options.steps, True, compiled, clip=clip) for clip in SHARES]
         alone, long = run_alone(2000, compiled), run_long(200, options.long, compiled)
-        results[way] = {"fleets": rows, "crowds": crowds, "alone": alone, "long": long}
+        results[way] = {"fleets": rows, "crowds": crowds, "clipped": clips, "alone": alone, "long": long}
         print(f"\n{way}")
         for row in rows:
             print(
@@ -134,6 +144,12 @@ def main(arguments: list[str]) -> None:
         print(f"  B = 1: median {alone['median']:.0f} us, 90 % below {alone['p90']:.0f} us")
         along, slots = ", ".join(f"{cost:.2f}" for cost in long["microseconds"]), long["slots"]
         print(f"  {long['steps']} steps of {long['robots']} robots: {along} us; slots {slots[0]}..{slots[-1]}")
+    for before, after in zip(results["torch"]["clipped"], results["compiled"]["clipped"], strict=True):
+        slow, fast = before["microseconds"], after["microseconds"]
+        print(
+            f"  B = {after['robots']}, noisy, clipped by {after['clip']}: torch {slow:.2f} us, compiled {fast:.2f} us, "
+            f"{slow / fast:.1f} x as fast; truths lost {after['truths_lost']}"
+        )
     results["peak_memory_MiB"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(f"\npeak memory {results['peak_memory_MiB']:.0f} MiB")
     print(f"saved: {save('fleet', results, ['torch', 'numpy', 'scipy', 'numba'])}")

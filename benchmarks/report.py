@@ -98,6 +98,17 @@ def fleet(found: dict[str, Any]) -> str:
             f"{long['steps']} noisy updates of {long['robots']} robots, in ten pieces: {along} µs each; slots of the "
             f"sets {long['slots'][0]} to {long['slots'][-1]}; truths lost {long['truths_lost']}.\n"
         )
+    if "clipped" in found["compiled"]:
+        body = [
+            [
+                after["clip"], after["robots"], number(before["microseconds"]), number(after["microseconds"]),
+                number(before["microseconds"] / after["microseconds"]), f"{after['share_cut']:.0%}",
+                after["truths_lost"],
+            ]
+            for before, after in zip(found["torch"]["clipped"], found["compiled"]["clipped"], strict=True)
+        ]  # fmt: skip
+        parts.append("**clipped nominal controls**, noisy, about half of the robots beyond the limit at first\n")
+        parts.append(table(["", "robots", "torch, µs", "compiled, µs", "ratio", "cut", "truths lost"], body))
     parts.append(f"Peak memory of the process: {found['peak_memory_MiB']:.0f} MiB.\n")
     return "\n".join(parts)
 

@@ -3,12 +3,15 @@
 Each robot avoids its 8 nearest bodies by the paper's rows (gain 1.5, Ds 0.4 m), and its control solves its QP exactly.
 The declared bound is 5 mm/s. `noisy` controls have an error in a disc of this radius, and sets are cut at most steps.
 Other controls are exact, as in a simulator's log, and sets are cut at the first steps only. Every 40 steps of 0.05 s
-all robots are moved to new places while their goals stay, so that a run can be of any length. Everything is seeded.
+all robots are moved to new places while their goals stay, so that a run can be of any length. `clip` limits the nominal
+controls by norm or by axis, at a speed that about half of the robots exceed at their new places. Everything is seeded.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -19,11 +22,15 @@ from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.neighbours import nearest_bodies
-from torchfsid.robots.tasks import GoalTask
+from torchfsid.robots.tasks import GoalTask, Saturation
 from torchfsid.sets.feasible_set import FeasibleSet
 
 NEIGHBOURS, STEP, EPISODE, ERROR = 8, 0.05, 40, 5e-3
 TASK, BARRIER = GoalTask(0.9), CollisionAvoidance(ClassK(1.5), safety_distance=0.4)
+SHARES = {"norm": 0.9, "box": 0.8}
+"""The limits of clipped nominal controls, for a square of 2 m [m/s]."""
+
+Clip = Literal["norm", "box"]
 
 
 def solve_qp(A: Tensor, b: Tensor, nominal: Tensor) -> Tensor:
@@ -49,9 +56,11 @@ def solve_qp(A: Tensor, b: Tensor, nominal: Tensor) -> Tensor:
 class Fleet:
     """The robots. Iterating gives time, positions and measured controls, without end."""
 
-    def __init__(self, robots: int, noisy: bool = False, seed: int = 0) -> None:
+    def __init__(self, robots: int, noisy: bool = False, seed: int = 0, clip: Clip | None = None) -> None:
         self.error = ERROR if noisy else 0.0
         self.rng, self.half = np.random.default_rng(seed), float(np.ceil(np.sqrt(robots)))
+        limit = None if clip is None else SHARES[clip] * self.half
+        self.task = TASK if limit is None else replace(TASK, saturation=Saturation(clip, (limit, limit)))
         self.goals = self._places(robots)
 
     def _places(self, robots: int) -> Tensor:
@@ -67,9 +76,9 @@ class Fleet:
             if step % EPISODE == 0:
                 x = self._places(robots)
             rows = BARRIER(nearest_bodies(0.0, x, count=NEIGHBOURS))
-            u = solve_qp(
-                rows.A, rows.b.masked_fill((rows.A == 0).all(-1), torch.inf).nan_to_num(1e9), 0.9 * (self.goals - x)
-            )
+            wish = 0.9 * (self.goals - x)
+            wish = wish if self.task.saturation is None else self.task.saturation(wish)
+            u = solve_qp(rows.A, rows.b.masked_fill((rows.A == 0).all(-1), torch.inf).nan_to_num(1e9), wish)
             angle, size = self.rng.uniform(0, 2 * np.pi, robots), self.error * np.sqrt(self.rng.uniform(0, 1, robots))
             error = torch.from_numpy(size[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
             yield STEP * step, x, torch.where((u == 0).all(-1, keepdim=True), u, u + error)
@@ -81,9 +90,9 @@ class Fleet:
         return FeasibleSet.from_box(-corner, corner)
 
 
-def observer(prior: FeasibleSet, compiled: bool) -> SetMembershipObserver:
+def observer(prior: FeasibleSet, compiled: bool, task: GoalTask = TASK) -> SetMembershipObserver:
     """The observer of the sets, compiled or in torch."""
-    return SetMembershipObserver(TASK, [BARRIER], prior, noise=NoiseBound(ERROR), compiled=compiled)
+    return SetMembershipObserver(task, [BARRIER], prior, noise=NoiseBound(ERROR), compiled=compiled)
 
 
 def measured(t: float, x: Tensor, u: Tensor, robots: range | None = None, neighbours: int = NEIGHBOURS) -> Measurement:

@@ -22,7 +22,7 @@ from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.barriers import SpeedPolygon
 from torchfsid.robots.bounds import NoiseBound, RowErrors
 from torchfsid.robots.measurement import Measurement
-from torchfsid.robots.tasks import AffineTask, GoalTask, Saturation
+from torchfsid.robots.tasks import AffineTask, GoalTask, Saturation, UnknownGainGoalTask
 from torchfsid.sets.feasible_set import FeasibleSet
 
 
@@ -153,6 +153,63 @@ def outline(event: Event) -> tuple:
     return event.t, event.robot, event.status, event.reset, event.rows[0]
 
 
+SATURATIONS = [
+    Saturation("norm", (0.5, 0.5)),
+    Saturation("box", (0.5, 0.3)),
+    Saturation("norm", (0.5, 0.5), dead_speed=0.1),
+    Saturation("box", (0.5, 0.3), dead_speed=0.1),
+    Saturation("norm", (np.inf, np.inf), dead_speed=0.1),
+]
+
+
+@pytest.mark.parametrize("saturation", SATURATIONS, ids=["norm", "box", "lazy norm", "lazy box", "dead zone only"])
+@pytest.mark.parametrize("errors", [False, True], ids=["exact positions", "position errors"])
+@pytest.mark.parametrize("m", [0, 1, 3])
+def test_clipped_nominal_controls(saturation: Saturation, errors: bool, m: int) -> None:
+    """Robots that are clipped for sure, perhaps, or never. Some have no theta left, and their u is out of reach.
+
+    The rows that hold u back, directions and C theta + d are all wrong by up to their bounds: the truth stays inside.
+    """
+    rng, count = np.random.default_rng(7), 1500
+    shift, turn = (0.05, rng.uniform(0, 0.2, (count, m))) if errors else (0.0, np.zeros((count, m)))
+    delta, width = rng.uniform(1e-4, 0.03, count), np.exp(rng.uniform(np.log(0.02), np.log(3.0), (count, 1)))
+    C, d, theta = np.eye(2) + rng.uniform(-0.2, 0.2, (count, 2, 2)), rng.normal(size=(count, 2)), np.zeros((count, 2))
+    disc = rng.normal(size=(2, count, 2))
+    disc *= rng.uniform(size=(2, count, 1)) / np.linalg.norm(disc, axis=-1, keepdims=True)
+    direction, may_hold = rng.uniform(0, 2 * np.pi, (count, m)), rng.uniform(size=(count, m)) < 0.4
+
+    def rows(angle: np.ndarray) -> np.ndarray:
+        return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+    multipliers = rng.exponential(0.5, (count, m, 1)) * (may_hold & (rng.uniform(size=(count, m)) < 0.8))[..., None]
+    held = (multipliers * rows(direction + rng.uniform(-1, 1, (count, m)) * turn)).sum(1)
+    u = saturation(torch.from_numpy(d + shift * disc[0])).numpy() - held + delta[:, None] * disc[1]
+    A = rows(direction)
+    b = (A * u[:, None]).sum(-1) + np.where(may_hold, rng.uniform(-1, 1, (count, m)) * delta[:, None], 1.0)
+    u[::10] *= 5.0
+    u, A, b, turn = map(torch.from_numpy, (u, A, b, turn))
+    told = RowErrors(turn, torch.zeros_like(turn))
+    barrier = AffineBarrier(A, b, tuple("abc"[:m]), row_errors=lambda *_: told)
+    task = AffineTask(torch.from_numpy(C), torch.from_numpy(d), ("p", "q"), sensitivity=1.0, saturation=saturation)
+    noise = NoiseBound(torch.from_numpy(delta), position=shift)
+    model = ObservationModel(task, [barrier], noise=noise)
+    middle = theta + rng.uniform(-0.45, 0.45, (count, 2)) * width
+    prior = FeasibleSet.from_box(torch.from_numpy(middle - width / 2), torch.from_numpy(middle + width / 2))
+    nobody = torch.zeros(count, 0, 2, dtype=torch.float64)
+    seen = Measurement(0.0, torch.zeros_like(u), u, nobody, nobody[..., 0].bool())
+    reference, compiled = (evidence(model, prior, seen, wish) for wish in (False, True))
+
+    honest = compiled.informative & (torch.arange(count) % 10 > 0)
+    assert compiled.omega.slack(torch.from_numpy(theta))[honest].min() > -1e-9
+    impossible = [((each.omega.A == 0).all(-1) & (each.omega.b < 0)).any(-1) for each in (reference, compiled)]
+    assert torch.equal(*impossible)
+    assert bool(impossible[0].any()) == (max(saturation.limits) < np.inf)
+    assert torch.equal(reference.informative, compiled.informative)
+    # Faces of a box count as touched within 1e-9, and steep edges enlarge this.
+    off = 1e-9 if saturation.shape == "norm" else 1e-6
+    np.testing.assert_allclose(unordered(compiled.omega), unordered(reference.omega), rtol=off, atol=off)
+
+
 def test_compiled_code_is_used_only_where_it_can_be() -> None:
     model = ObservationModel(GoalTask(1.0), [SpeedPolygon(8, 1.0)], noise=NoiseBound(0.01))
     x = torch.zeros(1, 2, dtype=torch.float64)
@@ -166,12 +223,16 @@ def test_compiled_code_is_used_only_where_it_can_be() -> None:
         of(learned, True)
     with torch.no_grad():
         of(learned, True)
-    saturated = GoalTask(0.9, saturation=Saturation("norm", (1.0, 1.0)))
+    cube = FeasibleSet.from_box(*torch.tensor([[[-1.0] * 3], [[1.0] * 3]], dtype=torch.float64))
     with pytest.raises(InputError, match="compiled"):
-        SetMembershipObserver(saturated, [], square(1), noise=NoiseBound(0.01), compiled=True)
-    clipped = ObservationModel(saturated, model.barriers, noise=model.noise)
-    with pytest.raises(InputError, match="clipped"):
-        evidence(clipped, square(1), Measurement.of_team(0.0, x, x), True)
+        SetMembershipObserver(UnknownGainGoalTask(), [], cube, noise=NoiseBound(0.01), compiled=True)
+    unknown_gain = ObservationModel(UnknownGainGoalTask(), model.barriers, noise=model.noise)
+    with pytest.raises(InputError, match="planar"):
+        evidence(unknown_gain, cube, Measurement.of_team(0.0, x, x), True)
+    clipped = ObservationModel(GoalTask(0.9, saturation=SATURATIONS[0]), model.barriers, noise=model.noise)
+    corner = torch.ones(1, 2, dtype=torch.float64).requires_grad_()
+    with pytest.raises(InputError, match="gradients"):
+        evidence(clipped, FeasibleSet.from_box(-corner, corner), Measurement.of_team(0.0, x, x), True)
 
 
 @pytest.mark.parametrize("kind", ["inverse_optimal", "critical_region"])

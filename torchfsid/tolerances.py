@@ -38,3 +38,9 @@ CRITICAL_NORMALS = 3
 
 SPREAD = (-1.0, -1 / 3, 1 / 3, 1.0)
 """A row of uncertain direction is a fan of generators at these fractions of its angle: dense enough for any angle."""
+
+SAMPLED = 32
+"""Directions in which the circle of a speed limit is sampled."""
+
+ON_LIMIT = 1e-9
+"""A control this close to its limit, relative to it, touches it. A dead zone is touched alike."""

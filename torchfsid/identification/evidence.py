@@ -26,6 +26,7 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Literal
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -44,6 +45,9 @@ from torchfsid.robots.neighbours import left_out_inactive
 from torchfsid.robots.tasks import Task
 from torchfsid.sets.feasible_set import FeasibleSet
 from torchfsid.tolerances import ACTIVE_TOLERANCE, ROUND_OFF
+
+NO_CLIP = (np.empty(0), False, 0.0, np.empty((0, 0, 2)))
+"""`clip` of `kernels.evidence` for nominal controls that are not clipped."""
 
 SetKind = Literal["critical_region", "inverse_optimal"]
 
@@ -246,7 +250,7 @@ def _sample(model: ObservationModel, theta: FeasibleSet, measurement: Measuremen
     largest = bound.squeeze(-1)  # slack of an active row whose position is exact
     uncertain = getattr(model.task, "uncertain", False)
     if errors is not None or model.task.saturation is not None or uncertain:
-        corners = theta.vertices().repeat(items // max(robots, 1), 1, 1)
+        corners = theta.vertices().expand(items // max(robots, 1), -1, -1, -1).flatten(0, 1)
         if errors is not None:
             drift = model.task.drift(errors, corners.abs().amax(-2))
         if uncertain:
@@ -306,9 +310,11 @@ def _can_be_compiled(model: ObservationModel, sample: _Sample, wanted: bool | No
     if wanted is False:
         return False
     tensors = [sample.rows.A, sample.rows.b, sample.C, sample.d, sample.u, sample.bound, sample.ball, sample.drift]
+    if model.task.saturation is not None and sample.corners is not None:
+        tensors.append(sample.corners)
     obstacle = None
-    if not sample.rows.dim == sample.C.shape[-1] == 2 or model.task.saturation is not None:
-        obstacle = "theta is not planar, or the nominal control is clipped"
+    if not sample.rows.dim == sample.C.shape[-1] == 2:
+        obstacle = "theta is not planar"
     elif torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
         obstacle = "gradients are required"
     elif not all(tensor.is_cpu for tensor in tensors):
@@ -322,10 +328,14 @@ def _compiled(model: ObservationModel, sample: _Sample) -> Evidence:
     angles = sample.u[:, :0] if sample.row_errors is None else sample.row_errors.angle
     tensors = (
         sample.rows.A, sample.rows.b, sample.hard, sample.relaxed, sample.C, sample.d, sample.u, sample.usable,
-        torch.atleast_2d(sample.bound), angles, torch.atleast_1d(sample.ball + sample.drift),
+        torch.atleast_2d(sample.bound), angles, torch.atleast_1d(sample.ball), torch.atleast_1d(sample.drift),
     )  # fmt: skip
-    paper = model.kind == "critical_region"
-    rows, judged, kkt = kernel.evidence(*map(array, tensors), paper, model.active_tolerance)
+    saturation, paper, clip = model.task.saturation, model.kind == "critical_region", NO_CLIP
+    if saturation is not None:
+        assert sample.corners is not None
+        limits = np.array(saturation.limits, dtype=np.float64)
+        clip = limits, saturation.shape == "norm", float(saturation.dead_speed), array(sample.corners)
+    rows, judged, kkt = kernel.evidence(*map(array, tensors), clip, paper, model.active_tolerance)
     informative, alarmed, infeasible, slack, excess = map(torch.from_numpy, judged)
     solved = KktSolution(*map(torch.from_numpy, kkt))
     omega = Halfspaces(*map(torch.from_numpy, rows))

@@ -114,7 +114,7 @@ def set_around(
     if possible is None:
         raise InputError("possible", "the nominal controls that are still possible, for a saturation", None)
     nominal = Halfspaces(normals, dot(normals, u.unsqueeze(-2)) + ball.unsqueeze(-1), source).where(needed)
-    nominal = unclipped(nominal, saturation, possible, drift)
+    nominal = unclipped(nominal, saturation, possible, drift, 2 * m)
     is_row = (nominal.A != 0).any(-1)
     return Halfspaces(nominal.A, nominal.b + drift.unsqueeze(-1) * is_row, nominal.source).pullback(C, d)
 

@@ -10,11 +10,12 @@ of these y is
 
     P (+) Cn,      Cn = the cone of the directions in which P touches the limit,
 
-that is n.y <= h_P(n), h_P the support function, for the normals n in the polar cone of Cn. Without saturation Cn = {0}
-and the hull is P. Theta sharpens the set. If no possible theta is clipped, Cn = {0}. If all of them are clipped by
-norm, y lies in Cn itself, beyond the chord between the ends of the arc in which Q meets the circle. In a dead zone |y|
-<= w the control is zero. If Q contains zero, the ball of radius w joins the hull. Every approximation gives an outer
-set.
+that is n.y <= h_P(n), h_P the support function, for the normals n in the polar cone of Cn. These are the normals of Q
+that are polar, and the ends of the polar cone. Theta sharpens the set. If no possible theta is clipped, or Q does not
+touch the limit, y = uhat, and the half-spaces are those of Q. If all of them are clipped by norm, uhat is on the limit,
+and P is only the arcs in which Q meets the circle. One more normal, between the ends, stands for their chord.
+In a dead zone |y| <= w the control is zero. If Q contains zero, the ball of radius w joins the hull. Every
+approximation gives an outer set. Compiled code does the same for planar theta (`kernels.saturation`).
 """
 
 from __future__ import annotations
@@ -27,21 +28,11 @@ from torch import Tensor
 
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.identification.kkt import outward_normals
+from torchfsid.kernels.saturation import AROUND
 from torchfsid.outcome import Outcome
 from torchfsid.robots.tasks import Saturation
 from torchfsid.sets.polygon import Polygon
-
-DIRECTIONS = 32
-"""Directions in which a circle is sampled, and tangents that stand for it: 0.5 % more radius."""
-
-FAN = 17
-"""Normals over the polar of the cone of directions of saturation."""
-
-ON_LIMIT = 1e-9
-"""A control this close to the limit, relative to it, touches it."""
-
-ROUND_OFF = 1e-12
-"""A unit normal counts as polar to a direction if their product is at most this."""
+from torchfsid.tolerances import ANGLE_TOLERANCE, CRITICAL_NORMALS, ON_LIMIT
 
 
 def unclipped(
@@ -49,6 +40,7 @@ def unclipped(
     saturation: Saturation,
     possible: Float[Tensor, "*batch v 2"],
     margin: Float[Tensor, "*#batch"],
+    no_row: int = -1,
 ) -> Halfspaces:
     """An outer set of y, given half-spaces that hold uhat = clip(y).
 
@@ -57,10 +49,10 @@ def unclipped(
         saturation: how y is clipped.
         possible: points whose convex hull holds every possible y, namely C theta + d at the vertices of Theta [m/s].
         margin: the largest distance of y from that hull [m/s].
+        no_row: the source of half-spaces that repeat no row of Q.
 
     Returns:
-        Half-spaces of y. `source` is that of the row of Q that a half-space repeats. Elsewhere it is the largest of
-        these, which means "no single row".
+        Half-spaces of y. `source` is that of the row of Q that a half-space repeats.
     """
     shape = admissible.batch_shape
     flat = Halfspaces(admissible.A.reshape(-1, admissible.rows, 2), admissible.b.reshape(-1, admissible.rows))
@@ -68,67 +60,58 @@ def unclipped(
     rows = _unclipped(flat, saturation, wishes, margin.expand(shape).reshape(-1))
     source = None
     if admissible.source is not None:
-        blurred = admissible.source.amax(-1, keepdim=True)
-        fan, rest = FAN + 1, rows.rows - FAN - 1 - admissible.rows
-        source = torch.cat([blurred.expand(*shape, fan), admissible.source, blurred.expand(*shape, rest)], dim=-1)
+        source = admissible.source.new_full((*shape, rows.rows), no_row)
+        source[..., CRITICAL_NORMALS + 1 : -1] = admissible.source
     return Halfspaces(rows.A.reshape(*shape, *rows.A.shape[1:]), rows.b.reshape(*shape, rows.rows), source)
 
 
 def _unclipped(
     admissible: Halfspaces, saturation: Saturation, possible: Float[Tensor, "B v 2"], margin: Float[Tensor, "B"]
 ) -> Halfspaces:
-    batch, like = len(admissible.b), admissible.b
-    turn = 2 * math.pi * torch.arange(DIRECTIONS, dtype=like.dtype, device=like.device) / DIRECTIONS
-    around = torch.stack([turn.cos(), turn.sin()], dim=-1)
+    batch, own, like = len(admissible.b), admissible.A, admissible.b
+    around = torch.from_numpy(AROUND).to(like.device)
     by_norm = saturation.shape == "norm"
     # A limit beyond every possible y is no limit, and may be replaced by any finite one.
     farthest = possible.norm(dim=-1).amax(-1, keepdim=True) + margin.unsqueeze(-1)
     limits = torch.minimum(like.new_tensor(saturation.limits), 2 * farthest.detach())
-    corner = Polygon.from_box(-limits, limits)
-    reach = limits[:, :1] if by_norm else 2 * limits.amax(-1, keepdim=True)
-    tangents = Halfspaces(around, reach.expand(-1, DIRECTIONS))
-    inside = Halfspaces.stack([admissible, tangents])
-    no_source = torch.zeros_like(inside.b, dtype=torch.long)
-    clipped = corner.clip(inside.A, inside.b, torch.zeros_like(inside.b), no_source, most=inside.rows + 4)
-
+    no_source = torch.zeros_like(like, dtype=torch.long)
+    cut = Polygon.from_box(-limits, limits).clip(own, like, torch.zeros_like(like), no_source, admissible.rows + 4)
+    vertices, within = cut.body.vertices, (cut.outcome != Outcome.EMPTY).unsqueeze(-1)
     if by_norm:
         outward, touched = _arcs(admissible, limits[:, :1], around)
+        within = within & (vertices.detach().norm(dim=-1) <= limits[:, :1])
         can_clip = farthest > limits[:, :1]
     else:
         axes = torch.eye(2, dtype=like.dtype, device=like.device)
         outward, faces = torch.cat([axes, -axes]).expand(batch, 4, 2), limits.repeat(1, 2)
-        touched = clipped.body.support(outward) >= faces * (1 - ON_LIMIT)
+        within = within.expand(-1, vertices.shape[1])
+        touched = _support(outward, vertices, within) >= faces * (1 - ON_LIMIT)
         can_clip = (outward @ possible.mT).amax(-1) + margin.unsqueeze(-1) > faces
     touched = touched & can_clip
+    may_touch = touched.any(-1, keepdim=True)
 
-    fan = outward_normals(outward, touched, FAN).normals
-    normals = torch.cat([fan, admissible.A], dim=1)
-    away = (normals @ outward.mT).masked_fill(~touched.unsqueeze(1), -torch.inf).amax(-1)
-    polar = (away <= ROUND_OFF) & (normals != 0).any(-1)
-    offsets = clipped.body.support(normals)
+    nearest = (around @ possible.mT).amin(-1).amax(-1, keepdim=True) - margin.unsqueeze(-1)
+    dead = saturation.dead_speed
+    idle = (like >= -ON_LIMIT * dead).all(-1, keepdim=True) & (nearest <= dead) & (dead > 0)
+    impossible = can_clip.any(-1, keepdim=True) & ~may_touch & ~within.any(-1, keepdim=True)
 
-    nearest = (around @ possible.mT).amin(-1).amax(-1) - margin
-    surely_clipped = (nearest > limits[:, 0]) & by_norm
-    zero_admissible = (admissible.b >= 0).all(-1)
-    idle = zero_admissible & (nearest <= saturation.dead_speed)
-    offsets = torch.where(idle.unsqueeze(-1), offsets.clamp(min=saturation.dead_speed), offsets)
-    offsets = torch.where(surely_clipped.unsqueeze(-1), 0.0, offsets)
+    fan = outward_normals(outward, touched, CRITICAL_NORMALS).normals
+    offsets = _support(fan, vertices, within)
+    if by_norm:
+        on_limit = limits[:, :1] * _support(fan, outward, touched)
+        offsets = torch.where(nearest > limits[:, :1], on_limit, torch.maximum(on_limit, offsets))
+    normals, offsets = torch.cat([fan, own], dim=1), torch.cat([offsets, like], dim=-1)
+    offsets = torch.where(idle, offsets.clamp(min=dead), offsets)
+    keep = torch.cat([may_touch.expand(-1, fan.shape[1]), _support(own, outward, touched) <= ANGLE_TOLERANCE], dim=-1)
+    rows = Halfspaces(normals, offsets).where(keep & (normals != 0).any(-1) & ~impossible)
+    return Halfspaces.stack([rows, Halfspaces(torch.zeros_like(own[:, :1]), torch.where(impossible, -1.0, 1.0))])
 
-    # The chord: with m the middle of Cn, m.y >= v min m.g over its directions g.
-    middle = -fan[:, FAN // 2]
-    chord = limits[:, 0] * (outward @ middle.unsqueeze(-1)).squeeze(-1).masked_fill(~touched, torch.inf).amin(-1)
-    has_chord = surely_clipped & touched.any(-1) & (middle != 0).any(-1)
 
-    impossible = (clipped.outcome == Outcome.EMPTY) | (surely_clipped & ~touched.any(-1))
-    return Halfspaces.stack(
-        [
-            Halfspaces(normals, offsets).where(polar & ~(surely_clipped & ~touched.any(-1)).unsqueeze(-1)),
-            Halfspaces(-middle.unsqueeze(1), -torch.where(has_chord, chord, 0.0).unsqueeze(1)).where(
-                has_chord.unsqueeze(-1)
-            ),
-            Halfspaces(torch.zeros_like(middle).unsqueeze(1), torch.where(impossible, -1.0, 1.0).unsqueeze(1)),
-        ]
-    )
+def _support(
+    normals: Float[Tensor, "B k 2"], points: Float[Tensor, "B v 2"], are_points: Bool[Tensor, "B v"]
+) -> Float[Tensor, "B k"]:
+    """The support function of the hull of some points; -inf if there are none."""
+    return (normals @ points.mT).masked_fill(~are_points.unsqueeze(1), -torch.inf).amax(-1)
 
 
 def _arcs(

@@ -16,6 +16,7 @@ from typing import no_type_check
 import numpy as np
 
 from torchfsid.kernels.compiled import item, launcher
+from torchfsid.kernels.saturation import ROWS, unclipped, workspace
 from torchfsid.tolerances import ANGLE_TOLERANCE, CRITICAL_NORMALS, NORMALS, RANK_TOLERANCE, ROUND_OFF, SPREAD
 
 PI, TURN = math.pi, 2 * math.pi
@@ -242,9 +243,27 @@ def inverse_optimal(k, m, u, ball, C, d, normals, generator, count, none, row_A,
         row_source[k, n] = 2 * m if generator[n] == none else m + generator[n] % m
 
 
+@item
+@no_type_check
+def clipped_inverse_optimal(
+    k, m, u, ball, drift, C, d, clip, normals, generator, count, none, work, row_A, row_b, row_source
+):
+    """The rows of `identification.inverse_optimal_set` for a clipped nominal control that are not padding."""
+    found_A, found_b, found_of = work[-1]
+    is_bounded = count > 0 and generator[0] == none
+    found = unclipped(k, C, d, u, ball, drift, clip, normals, count, is_bounded, work)
+    for n in range(found):
+        p, q, of = found_A[n, 0], found_A[n, 1], found_of[n]
+        for i in range(2):
+            row_A[k, n, i] = p * C[k, 0, i] + q * C[k, 1, i]
+        room = drift if p != 0 or q != 0 else 0.0
+        row_b[k, n] = found_b[n] + room - p * d[k, 0] - q * d[k, 1]
+        row_source[k, n] = 2 * m if of < 0 or generator[of] == none else m + generator[of] % m
+
+
 @launcher
 @no_type_check
-def evidence(A, b, hard, relaxed, C, d, u, usable, bound, angles, ball, paper, active_tolerance):
+def evidence(A, b, hard, relaxed, C, d, u, usable, bound, angles, ball, drift, clip, paper, active_tolerance):
     """What a measurement of B robots says about theta, and their KKT conditions.
 
     Args:
@@ -258,7 +277,10 @@ def evidence(A, b, hard, relaxed, C, d, u, usable, bound, angles, ball, paper, a
         usable: (B,), whether the sample may be used.
         bound: (B or 1, m or 1), the largest slack of an active row [m/s].
         angles: (B, m), errors of the rows' directions [rad], or (B, 0) if there are none.
-        ball: (B or 1,), a bound on the error of C theta + d - u [m/s].
+        ball: (B or 1,), a bound on the error of u [m/s].
+        drift: (B or 1,), a bound on the error of C theta + d [m/s].
+        clip: how the nominal control is clipped: (limits (2,), whether by norm, dead speed) as in `Saturation`, and the
+            vertices of Theta (B, v, 2). No limits (0,) if it is not.
         paper: whether the half-spaces are those of the critical region.
         active_tolerance: the slack below which a row counts as active [m/s].
 
@@ -270,7 +292,8 @@ def evidence(A, b, hard, relaxed, C, d, u, usable, bound, angles, ball, paper, a
     fan = angles[:, :0] if paper else angles
     generators = m * len(SPREAD) if fan.shape[1] > 0 else m
     around = CRITICAL_DIRECTIONS if paper else DIRECTIONS
-    R = (m if paper else 0) + len(around) + 1
+    clips, work = len(clip[0]) > 0, workspace(clip[3].shape[1])
+    R = ROWS if clips else (m if paper else 0) + len(around) + 1
     row_A, row_b, row_source = np.zeros((B, R, 2)), np.ones((B, R)), np.full((B, R), -1)
     informative, alarmed, infeasible = np.empty(B, np.bool_), np.empty(B, np.bool_), np.zeros(B, np.bool_)
     slack, excess = np.empty((B, m)), np.empty((B, m))
@@ -307,8 +330,12 @@ def evidence(A, b, hard, relaxed, C, d, u, usable, bound, angles, ball, paper, a
                 row_A, row_b, row_source,
             )  # fmt: skip
         else:
-            room = ball[min(k, len(ball) - 1)]
-            inverse_optimal(k, m, u, room, C, d, normals, generator, count, generators, row_A, row_b, row_source)
+            room, shift = ball[min(k, len(ball) - 1)], drift[min(k, len(drift) - 1)]
+            of = normals, generator, count, generators
+            if clips:
+                clipped_inverse_optimal(k, m, u, room, shift, C, d, clip, *of, work, row_A, row_b, row_source)
+            else:
+                inverse_optimal(k, m, u, room + shift, C, d, *of, row_A, row_b, row_source)
     return (
         (row_A, row_b, row_source),
         (informative, alarmed, infeasible, slack, excess),

@@ -106,7 +106,7 @@ class SetMembershipObserver:
 
     Raises:
         InputError: the prior is not a batch (B,) over the task's parameters; `inverse_optimal` comes without `noise`;
-            `compiled` is True, but theta is not planar or the nominal control is clipped.
+            `compiled` is True, but theta is not planar.
     """
 
     task: Task
@@ -130,8 +130,8 @@ class SetMembershipObserver:
             actual = (*self.feasible_set.batch_shape, self.feasible_set.dim)
             raise InputError("feasible_set", f"a batch (B,) of sets over the task's {p} parameters", actual)
         self.model = ObservationModel(self.task, self.barriers, self.kind, self.noise, self.active_tolerance)
-        if self.compiled and not (p == 2 and self.task.saturation is None):
-            raise InputError("compiled", "None or False unless theta is planar and nothing is clipped", True)
+        if self.compiled and p != 2:
+            raise InputError("compiled", "None or False unless theta is planar", True)
         self.prior = self.feasible_set
         self.status = torch.zeros_like(self.feasible_set.outcome)
         self.skipped = self.infeasible = torch.zeros_like(self.status)
