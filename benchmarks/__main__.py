@@ -1,4 +1,4 @@
-"""python -m benchmarks {geometry, layers, fleet, observer, gradients, safety} [options of the benchmark]"""
+"""python -m benchmarks {geometry, layers, fleet, observer, gradients, safety, orca} [options of the benchmark]"""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 import sys
 from importlib import import_module
 
-NAMES = ("geometry", "layers", "fleet", "observer", "gradients", "safety")
+NAMES = ("geometry", "layers", "fleet", "observer", "gradients", "safety", "orca")
 
 
 def main(arguments: list[str]) -> int:

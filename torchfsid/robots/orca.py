@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -34,7 +34,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchfsid.errors import InputError
-from torchfsid.halfspaces import Halfspaces, dot
+from torchfsid.halfspaces import Halfspaces
 from torchfsid.robots.avoidance import NeighbourVelocity
 from torchfsid.robots.bounds import ErrorBounds, RowErrors
 from torchfsid.robots.measurement import Measurement
@@ -45,25 +45,59 @@ SINGLE = 2.0**-22
 
 
 class _Pairs(NamedTuple):
-    """Robots and neighbours: p [m], r = |p|, R [m], w_rel and the mean velocity (v_i + v_j)/2 [m/s].
+    """Robots and neighbours, component by component: two-vectors at the end of a tensor would be several times slower.
 
-    Where a neighbour is pushed away, p was multiplied by `scale`.
+    Attributes:
+        px, py: p [m].
+        r: |p| [m].
+        R: the sum of the radii [m].
+        wx, wy: w_rel [m/s].
+        mx, my: the mean velocity (v_i + v_j)/2 [m/s].
+        scale: by which p was multiplied where a neighbour is pushed away.
     """
 
-    p: Float[Tensor, "*batch 2"]
+    px: Float[Tensor, "*batch"]
+    py: Float[Tensor, "*batch"]
     r: Float[Tensor, "*batch"]
     R: Float[Tensor, "*batch"]
-    w_rel: Float[Tensor, "*batch 2"]
-    mean: Float[Tensor, "*batch 2"]
+    wx: Float[Tensor, "*batch"]
+    wy: Float[Tensor, "*batch"]
+    mx: Float[Tensor, "*batch"]
+    my: Float[Tensor, "*batch"]
     scale: Float[Tensor, "*batch"]
 
 
 class _Rows(NamedTuple):
     """Rows n.u >= low of one branch, and |w| [m/s], which decides how well n is known on a circle."""
 
-    n: Float[Tensor, "*batch 2"]
+    nx: Float[Tensor, "*batch"]
+    ny: Float[Tensor, "*batch"]
     low: Float[Tensor, "*batch"]
     speed: Float[Tensor, "*batch"]
+
+
+class _Look(NamedTuple):
+    """What the rows of a measurement are made of.
+
+    Attributes:
+        measurement: the measurement.
+        pairs: robots and neighbours.
+        T: time horizon, or time step while bodies overlap [s].
+        touches: whether bodies overlap.
+        beyond: how far w is beyond the legs, -w.p - R |w| [m^2/s]; positive for a circle.
+        turn: det(p, w) [m^2/s].
+        on_circle: whether the row is that of a circle.
+        rows: the rows of the branches that follow from the numbers as they are.
+    """
+
+    measurement: Measurement
+    pairs: _Pairs
+    T: Float[Tensor, "*batch m"]
+    touches: Bool[Tensor, "*batch m"]
+    beyond: Float[Tensor, "*batch m"]
+    turn: Float[Tensor, "*batch m"]
+    on_circle: Bool[Tensor, "*batch m"]
+    rows: _Rows
 
 
 @dataclass(frozen=True)
@@ -94,6 +128,7 @@ class Orca:
     relaxes: ClassVar[bool] = True
     uncertain: ClassVar[bool] = True
     neighbour_velocity: ClassVar[NeighbourVelocity] = "previous"
+    _looks: list[_Look] = field(init=False, default_factory=list, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         for name in ("time_horizon", "time_step", "max_speed", "count", "distance"):
@@ -113,35 +148,32 @@ class Orca:
         return self.max_speed
 
     def __call__(self, measurement: Measurement) -> Halfspaces:
-        pairs = self._pairs(measurement)
-        return self._stacked(pairs, self._nearest(measurement, pairs.r), measurement)
+        look = self._look(measurement)
+        return self._stacked(look, self._nearest(measurement, look.pairs.r))
 
     def rows_within(self, measurement: Measurement, bounds: ErrorBounds) -> Halfspaces:
         """The rows of all bodies that may be among the chosen neighbours."""
-        pairs = self._pairs(measurement)
-        e, _ = _uncertainty(pairs, bounds)
-        return self._stacked(pairs, self._chosen(measurement, pairs.r, e)[0], measurement)
+        look = self._look(measurement)
+        e, _ = _uncertainty(look.pairs, bounds)
+        return self._stacked(look, self._chosen(measurement, look.pairs.r, e)[0])
 
     def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
         """See the module docstring. A body that may not be among the neighbours has a row that may be violated."""
-        u = measurement.u
-        assert u is not None
-        pairs = self._pairs(measurement)
+        assert measurement.u is not None
+        look = self._look(measurement)
+        pairs, rows = look.pairs, look.rows
         e, eps = _uncertainty(pairs, bounds)
         may_be, must_be = self._chosen(measurement, pairs.r, e)
-        u = u.unsqueeze(-2).expand_as(pairs.p)
-        touches = pairs.r <= pairs.R
-        on_circle = touches | _beyond_cutoff(pairs, self._w(pairs, touches))
-        T = torch.where(touches, self.time_step, self.time_horizon)
-        rows = self._rows(pairs)
-        angle, slack = _branch_errors(pairs, rows, u, e, eps, T, on_circle)
-        open_at = (self._is_open(pairs, rows, e, eps, touches) & may_be).nonzero(as_tuple=True)
+        ux, uy = (component.unsqueeze(-1).expand_as(e) for component in measurement.u.unbind(-1))
+        angle, slack = _branch_errors(pairs, rows, ux, uy, e, eps, look.T, look.on_circle)
+        open_at = (_is_open(look, e, eps) & may_be).nonzero(as_tuple=True)
         if len(open_at[0]):
-            some, drawn = _Pairs(*(v[open_at] for v in pairs)), _Rows(*(v[open_at] for v in rows))
-            wide = self._over_branches(some, drawn, u[open_at], e[open_at], eps[open_at])
+            some, own = _Pairs(*(v[open_at] for v in pairs)), _Rows(*(v[open_at] for v in rows))
+            wide = self._over_branches(some, own, *(v[open_at] for v in (ux, uy, e, eps)))
             angle, slack = angle.index_put(open_at, wide.angle), slack.index_put(open_at, wide.slack)
-        violated = (rows.low - dot(rows.n, u)).clamp(min=0.0)
-        slack = torch.where(must_be, slack, torch.maximum(slack, violated))
+        if not bool((must_be == may_be).all()):
+            violated = (rows.low - rows.nx * ux - rows.ny * uy).clamp(min=0.0)
+            slack = torch.where(must_be, slack, torch.maximum(slack, violated))
         of_bodies = RowErrors(torch.where(may_be, angle, 0.0), torch.where(may_be, slack, 0.0))
         return RowErrors.stack([of_bodies, SpeedDisc(self.max_speed).errors(measurement, bounds)])
 
@@ -157,41 +189,48 @@ class Orca:
     def labels(self, bodies: Sequence[str]) -> list[str]:
         return [*(f"avoid {body}" for body in bodies), "speed"]
 
+    def _look(self, measurement: Measurement) -> _Look:
+        """The rows' geometry. It is kept, since rows and errors of one measurement ask for it in turn."""
+        last = self._looks[-1] if self._looks else None
+        if last is None or last.measurement is not measurement:
+            pairs = self._pairs(measurement)
+            touches = pairs.r <= pairs.R
+            T = torch.where(touches, self.time_step, self.time_horizon)
+            wx, wy = pairs.wx - pairs.px / T, pairs.wy - pairs.py / T
+            circle = _circle(pairs, wx, wy, T)
+            beyond = -(wx * pairs.px + wy * pairs.py) - pairs.R * circle.speed
+            turn = pairs.px * wy - pairs.py * wx
+            on_circle = touches | (beyond > 0)
+            leg = _leg(pairs, torch.where(turn > 0, 1.0, -1.0), circle.speed)
+            nx, ny, low = (torch.where(on_circle, one, other) for one, other in zip(circle[:3], leg[:3], strict=True))
+            rows = _Rows(nx, ny, low, circle.speed)
+            last = _Look(measurement, pairs, T, touches, beyond, turn, on_circle, rows)
+            self._looks[:] = [] if rows.low.requires_grad else [last]  # a graph can be followed once only
+        return last
+
     def _pairs(self, measurement: Measurement) -> _Pairs:
         v, others = measurement.velocity, measurement.previous_body_velocities
         if v is None or others is None:
             raise InputError("measurement", "the velocities of robots and bodies one sample earlier", None)
         if measurement.radius is None or measurement.body_radii is None:
             raise InputError("measurement.radius", "radii of robots and bodies", None)
-        there = measurement.present.unsqueeze(-1)
-        p = torch.where(there, measurement.bodies - measurement.x.unsqueeze(-2), 1.0)
-        own = v.unsqueeze(-2)
-        others = torch.where(there, others, 0.0)
-        r, R = p.norm(dim=-1), measurement.radius.unsqueeze(-1) + measurement.body_radii + self.margin
+        absent = ~measurement.present
+        (x, y), (vx, vy) = (vector.unsqueeze(-1).unbind(-2) for vector in (measurement.x, v))
+        (jx, jy), (jvx, jvy) = measurement.bodies.unbind(-1), others.unbind(-1)
+        px, py = ((to - at).masked_fill(absent, 1.0) for to, at in ((jx, x), (jy, y)))
+        jvx, jvy = jvx.masked_fill(absent, 0.0), jvy.masked_fill(absent, 0.0)
+        r, R = (px * px + py * py).sqrt(), measurement.radius.unsqueeze(-1) + measurement.body_radii + self.margin
         scale = torch.ones_like(r)
         if self.push_away:
             near = (r < R + self.push_away) & (r > 0)
             scale = torch.where(near, (R + self.push_away) / torch.where(near, r, 1.0), 1.0)
-        return _Pairs(p * scale.unsqueeze(-1), r * scale, R, own - others, (own + others) / 2, scale)
+            px, py, r = px * scale, py * scale, r * scale
+        return _Pairs(px, py, r, R, vx - jvx, vy - jvy, (vx + jvx) / 2, (vy + jvy) / 2, scale)
 
-    def _w(self, pairs: _Pairs, touches: Bool[Tensor, "*batch"]) -> Float[Tensor, "*batch 2"]:
-        T = torch.where(touches, self.time_step, self.time_horizon)
-        return pairs.w_rel - pairs.p / T.unsqueeze(-1)
-
-    def _rows(self, pairs: _Pairs) -> _Rows:
-        """The rows of the branches that follow from the numbers as they are."""
-        touches = pairs.r <= pairs.R
-        w = self._w(pairs, touches)
-        circle = _circle(pairs, w, torch.where(touches, self.time_step, self.time_horizon))
-        leg = _leg(pairs, torch.where(_det(pairs.p, w) > 0, 1.0, -1.0), circle.speed)
-        on_circle = touches | _beyond_cutoff(pairs, w)
-        n = torch.where(on_circle.unsqueeze(-1), circle.n, leg.n)
-        return _Rows(n, torch.where(on_circle, circle.low, leg.low), circle.speed)
-
-    def _stacked(self, pairs: _Pairs, chosen: Bool[Tensor, "*batch m"], measurement: Measurement) -> Halfspaces:
-        rows = self._rows(pairs)
-        of_bodies = Halfspaces(-rows.n, -rows.low).where(chosen)
-        return Halfspaces.stack([of_bodies, SpeedDisc(self.max_speed)(measurement)])
+    def _stacked(self, look: _Look, chosen: Bool[Tensor, "*batch m"]) -> Halfspaces:
+        n = torch.stack([-look.rows.nx, -look.rows.ny], dim=-1)
+        of_bodies = Halfspaces(n, -look.rows.low).where(chosen)
+        return Halfspaces.stack([of_bodies, SpeedDisc(self.max_speed)(look.measurement)])
 
     def _nearest(self, measurement: Measurement, r: Float[Tensor, "*batch m"]) -> Bool[Tensor, "*batch m"]:
         """The neighbours that the controller chooses, if positions are exact."""
@@ -213,58 +252,54 @@ class Orca:
             must_be = must_be & (most < least.kthvalue(self.count + 1, dim=-1, keepdim=True).values)
         return may_be, must_be
 
-    def _is_open(
-        self, pairs: _Pairs, rows: _Rows, e: Tensor, eps: Tensor, touches: Bool[Tensor, "*batch"]
-    ) -> Bool[Tensor, "*batch"]:
-        """May the controller have taken another branch?"""
-        w = self._w(pairs, touches)
-        T = torch.where(touches, self.time_step, self.time_horizon)
-        of_w = eps + e / T
-        slow = rows.speed <= of_w
-        turned = 2 * (_asin(of_w / torch.where(slow, 1.0, rows.speed)) / 2).sin()
-        beyond = -dot(w, pairs.p) - pairs.R * rows.speed
-        cutoff = beyond.abs() <= rows.speed * (turned * pairs.r + e)
-        sides = _det(pairs.p, w).abs() <= pairs.r * of_w + e * rows.speed
-        ahead = beyond <= rows.speed * (turned * pairs.r + e)
-        contact = (pairs.r - pairs.R).abs() <= e
-        return contact | (~touches & (cutoff | slow | (sides & ahead)))
-
-    def _over_branches(self, pairs: _Pairs, rows: _Rows, u: Tensor, e: Tensor, eps: Tensor) -> RowErrors:
+    def _over_branches(self, pairs: _Pairs, rows: _Rows, ux: Tensor, uy: Tensor, e: Tensor, eps: Tensor) -> RowErrors:
         """The errors of rows that cover every branch possible within the bounds, for selected pairs (k,)."""
         apart, touching = pairs.r + e > pairs.R, pairs.r - e <= pairs.R
-        none = torch.zeros_like(apart)
-        w, w_touching = self._w(pairs, none), self._w(pairs, ~none)
-        far, near = (torch.full_like(pairs.r, T) for T in (self.time_horizon, self.time_step))
-        circle, overlap = _circle(pairs, w, far), _circle(pairs, w_touching, near)
-        slack = dot(rows.n, u) - rows.low
+        no, yes, one = torch.zeros_like(apart), torch.ones_like(apart), torch.ones_like(pairs.r)
+        far, near = self.time_horizon * one, self.time_step * one
+        circle, overlap = (_circle(pairs, pairs.wx - pairs.px / T, pairs.wy - pairs.py / T, T) for T in (far, near))
+        slack = rows.nx * ux + rows.ny * uy - rows.low
         worst = RowErrors.none(pairs.r)
         for branch, T, is_circle, possible in (
-            (circle, far, ~none, apart),
-            (_leg(pairs, torch.ones_like(pairs.r), circle.speed), far, none, apart),
-            (_leg(pairs, -torch.ones_like(pairs.r), circle.speed), far, none, apart),
-            (overlap, near, ~none, touching),
+            (circle, far, yes, apart),
+            (_leg(pairs, one, circle.speed), far, no, apart),
+            (_leg(pairs, -one, circle.speed), far, no, apart),
+            (overlap, near, yes, touching),
         ):
-            own, room = _branch_errors(pairs, branch, u, e, eps, T, is_circle)
-            between = torch.atan2(_det(rows.n, branch.n).abs(), dot(rows.n, branch.n))
-            room = room + (slack - dot(branch.n, u) + branch.low).abs()
+            own, room = _branch_errors(pairs, branch, ux, uy, e, eps, T, is_circle)
+            sin, cos = rows.nx * branch.ny - rows.ny * branch.nx, rows.nx * branch.nx + rows.ny * branch.ny
+            room = room + (slack - branch.nx * ux - branch.ny * uy + branch.low).abs()
             worst = RowErrors(
-                torch.where(possible, torch.maximum(worst.angle, own + between), worst.angle),
+                torch.where(possible, torch.maximum(worst.angle, own + torch.atan2(sin.abs(), cos)), worst.angle),
                 torch.where(possible, torch.maximum(worst.slack, room), worst.slack),
             )
         return worst
 
 
+def _is_open(look: _Look, e: Float[Tensor, "*batch m"], eps: Float[Tensor, "*batch m"]) -> Bool[Tensor, "*batch m"]:
+    """May the controller have taken another branch?"""
+    r, speed = look.pairs.r, look.rows.speed
+    of_w = eps + e / look.T
+    slow = speed <= of_w
+    # 2 sin(asin(s)/2) = s sqrt(2/(1 + sqrt(1 - s^2))) <= sqrt(2) s bounds the turn of w/|w|.
+    room = (math.sqrt(2) * r) * of_w + speed * e
+    cutoff, ahead = look.beyond.abs() <= room, look.beyond <= room
+    sides = look.turn.abs() <= r * of_w + e * speed
+    return ((r - look.pairs.R).abs() <= e) | (~look.touches & (cutoff | slow | (sides & ahead)))
+
+
 def _uncertainty(pairs: _Pairs, bounds: ErrorBounds) -> tuple[Float[Tensor, "*batch m"], Float[Tensor, "*batch m"]]:
     """e [m] and eps [m/s], single precision included."""
     e = pairs.scale * (bounds.position.unsqueeze(-1) + bounds.body_position) + SINGLE * pairs.r
-    speeds = pairs.mean.abs().sum(-1) + pairs.w_rel.abs().sum(-1)
+    speeds = pairs.mx.abs() + pairs.my.abs() + pairs.wx.abs() + pairs.wy.abs()
     return e, bounds.velocity.unsqueeze(-1) + bounds.body_velocity + SINGLE * speeds
 
 
 def _branch_errors(
     pairs: _Pairs,
     rows: _Rows,
-    u: Float[Tensor, "*batch 2"],
+    ux: Float[Tensor, "*batch"],
+    uy: Float[Tensor, "*batch"],
     e: Float[Tensor, "*batch"],
     eps: Float[Tensor, "*batch"],
     T: Float[Tensor, "*batch"],
@@ -281,38 +316,29 @@ def _branch_errors(
     circle = torch.where(known, _asin(error / torch.where(known, rows.speed, 1.0)), math.pi)
     angle = torch.where(on_circle, circle, legs)
     chord = 2 * (angle / 2).sin()
-    slack = eps / 2 + chord * (u - pairs.mean).norm(dim=-1)
-    slack = slack + torch.where(on_circle, (e + chord * pairs.r) / (2 * T), 0.0)
-    return RowErrors(angle, torch.where(angle < math.pi, slack, math.inf))
+    from_mean = ((ux - pairs.mx).square() + (uy - pairs.my).square()).sqrt()
+    slack = eps / 2 + chord * from_mean + on_circle * ((e + chord * pairs.r) / (2 * T))
+    return RowErrors(angle, slack.masked_fill(angle >= math.pi, math.inf))
 
 
-def _circle(pairs: _Pairs, w: Float[Tensor, "*batch 2"], T: Float[Tensor, "*batch"]) -> _Rows:
-    speed = w.norm(dim=-1)
-    known = speed > 0  # otherwise the direction is unknown: the row is NaN
-    n = torch.where(known.unsqueeze(-1), w / torch.where(known, speed, 1.0).unsqueeze(-1), math.nan)
-    return _Rows(n, dot(n, pairs.mean) + (pairs.R + dot(n, pairs.p)) / (2 * T), speed)
+def _circle(
+    pairs: _Pairs, wx: Float[Tensor, "*batch"], wy: Float[Tensor, "*batch"], T: Float[Tensor, "*batch"]
+) -> _Rows:
+    speed = (wx * wx + wy * wy).sqrt()
+    one = 1 / speed  # at w = 0 the direction is unknown: the row is NaN
+    nx, ny = wx * one, wy * one
+    low = nx * pairs.mx + ny * pairs.my + (pairs.R + nx * pairs.px + ny * pairs.py) / (2 * T)
+    return _Rows(nx, ny, low, speed)
 
 
 def _leg(pairs: _Pairs, side: Float[Tensor, "*batch"], speed: Float[Tensor, "*batch"]) -> _Rows:
     """The left (side 1) or right (side -1) leg. Where bodies overlap it is the one of bodies that just touch."""
-    x, y = pairs.p.unbind(-1)
-    apart = pairs.r > pairs.R
-    length = torch.where(apart, pairs.r.square() - pairs.R.square(), 1.0).sqrt() * apart
-    turned = side * torch.minimum(pairs.R, pairs.r)
-    size = torch.where(pairs.r > 0, pairs.r.square(), 1.0)
-    n = torch.stack([-(turned * x + y * length), x * length - turned * y], dim=-1) * (side / size).unsqueeze(-1)
-    return _Rows(n, dot(n, pairs.mean), speed)
-
-
-def _beyond_cutoff(pairs: _Pairs, w: Float[Tensor, "*batch 2"]) -> Bool[Tensor, "*batch"]:
-    """Is the relative velocity nearer to the cut-off circle than to the legs?"""
-    towards = dot(w, pairs.p)
-    return (towards < 0) & (towards.square() > pairs.R.square() * w.square().sum(-1))
-
-
-def _det(a: Float[Tensor, "*batch 2"], b: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    squared = pairs.r.square()
+    length = side * (squared - pairs.R.square()).clamp(min=0.0).sqrt()
+    R, scale = torch.minimum(pairs.R, pairs.r), 1 / squared.clamp(min=1e-300)
+    nx, ny = -(R * pairs.px + length * pairs.py) * scale, (length * pairs.px - R * pairs.py) * scale
+    return _Rows(nx, ny, nx * pairs.mx + ny * pairs.my, speed)
 
 
 def _asin(ratio: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    return ratio.clamp(0, 1).arcsin()
+    return ratio.clamp(max=1).arcsin()
