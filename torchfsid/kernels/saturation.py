@@ -137,13 +137,18 @@ def touch_face(normals, b, count, p, q, v, half):
 @item
 @no_type_check
 def add_vertices(x, y, r, v, w, by_norm, normals, count, is_bounded, points, n):
-    """Add the vertices of Q around u = (x, y) that are within the limits v, w to n points. Returns their number."""
+    """Add the vertices of Q around u = (x, y) that are within the limits v, w to n points. Returns their number.
+
+    All neighbouring rows of Q are the same angle apart.
+    """
+    cos = normals[0, 0] * normals[1, 0] + normals[0, 1] * normals[1, 1]
+    if count < 2 or cos <= 0:  # a half-plane, or a strip
+        return n
+    share = r / (1 + cos)
     for i in range(count if is_bounded else count - 1):
         j = i + 1 if i < count - 1 else 0
-        cos = normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1]
-        share = r / (1 + cos)
         p, q = x + share * (normals[i, 0] + normals[j, 0]), y + share * (normals[i, 1] + normals[j, 1])
-        if cos > 0 and is_within(p, q, v, w, by_norm):  # opposite rows do not meet
+        if is_within(p, q, v, w, by_norm):
             points[n, 0], points[n, 1] = p, q
             n += 1
     return n
