@@ -190,7 +190,7 @@ def evidence(
             not known exactly, and for position errors of tasks with an unknown gain.
         measurement: a measurement of these robots, or several concatenated.
         compiled: whether to run compiled code instead of torch. None chooses compiled code wherever it is possible:
-            controls and theta are planar, nothing is clipped, no gradient is needed, and tensors are on the CPU.
+            controls and theta are planar, no gradient is needed, and tensors are on the CPU.
 
     Raises:
         InputError: the measurement has no velocities, they are not finite for an observed robot, the measurement does

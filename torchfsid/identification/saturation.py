@@ -20,8 +20,6 @@ approximation gives an outer set. Compiled code does the same for planar theta (
 
 from __future__ import annotations
 
-import math
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -68,22 +66,22 @@ def unclipped(
 def _unclipped(
     admissible: Halfspaces, saturation: Saturation, possible: Float[Tensor, "B v 2"], margin: Float[Tensor, "B"]
 ) -> Halfspaces:
-    batch, own, like = len(admissible.b), admissible.A, admissible.b
-    around = torch.from_numpy(AROUND).to(like.device)
+    own, b = admissible.A, admissible.b
+    around = torch.from_numpy(AROUND).to(b.device)
     by_norm = saturation.shape == "norm"
     # A limit beyond every possible y is no limit, and may be replaced by any finite one.
     farthest = possible.norm(dim=-1).amax(-1, keepdim=True) + margin.unsqueeze(-1)
-    limits = torch.minimum(like.new_tensor(saturation.limits), 2 * farthest.detach())
-    no_source = torch.zeros_like(like, dtype=torch.long)
-    cut = Polygon.from_box(-limits, limits).clip(own, like, torch.zeros_like(like), no_source, admissible.rows + 4)
+    limits = torch.minimum(b.new_tensor(saturation.limits), 2 * farthest.detach())
+    no_source = torch.zeros_like(b, dtype=torch.long)
+    cut = Polygon.from_box(-limits, limits).clip(own, b, torch.zeros_like(b), no_source, admissible.rows + 4)
     vertices, within = cut.body.vertices, (cut.outcome != Outcome.EMPTY).unsqueeze(-1)
     if by_norm:
         outward, touched = _arcs(admissible, limits[:, :1], around)
         within = within & (vertices.detach().norm(dim=-1) <= limits[:, :1])
         can_clip = farthest > limits[:, :1]
     else:
-        axes = torch.eye(2, dtype=like.dtype, device=like.device)
-        outward, faces = torch.cat([axes, -axes]).expand(batch, 4, 2), limits.repeat(1, 2)
+        axes = torch.eye(2, dtype=b.dtype, device=b.device)
+        outward, faces = torch.cat([axes, -axes]).expand(len(b), 4, 2), limits.repeat(1, 2)
         within = within.expand(-1, vertices.shape[1])
         touched = _support(outward, vertices, within) >= faces * (1 - ON_LIMIT)
         can_clip = (outward @ possible.mT).amax(-1) + margin.unsqueeze(-1) > faces
@@ -92,7 +90,7 @@ def _unclipped(
 
     nearest = (around @ possible.mT).amin(-1).amax(-1, keepdim=True) - margin.unsqueeze(-1)
     dead = saturation.dead_speed
-    idle = (like >= -ON_LIMIT * dead).all(-1, keepdim=True) & (nearest <= dead) & (dead > 0)
+    idle = (b >= -ON_LIMIT * dead).all(-1, keepdim=True) & (nearest <= dead) & (dead > 0)
     impossible = can_clip.any(-1, keepdim=True) & ~may_touch & ~within.any(-1, keepdim=True)
 
     fan = outward_normals(outward, touched, CRITICAL_NORMALS).normals
@@ -100,7 +98,7 @@ def _unclipped(
     if by_norm:
         on_limit = limits[:, :1] * _support(fan, outward, touched)
         offsets = torch.where(nearest > limits[:, :1], on_limit, torch.maximum(on_limit, offsets))
-    normals, offsets = torch.cat([fan, own], dim=1), torch.cat([offsets, like], dim=-1)
+    normals, offsets = torch.cat([fan, own], dim=1), torch.cat([offsets, b], dim=-1)
     offsets = torch.where(idle, offsets.clamp(min=dead), offsets)
     keep = torch.cat([may_touch.expand(-1, fan.shape[1]), _support(own, outward, touched) <= ANGLE_TOLERANCE], dim=-1)
     rows = Halfspaces(normals, offsets).where(keep & (normals != 0).any(-1) & ~impossible)

@@ -16,7 +16,7 @@ from typing import no_type_check
 import numpy as np
 
 from torchfsid.kernels.compiled import item, launcher
-from torchfsid.kernels.saturation import ROWS, unclipped, workspace
+from torchfsid.kernels.saturation import ROWS, clipped_inverse_optimal, workspace
 from torchfsid.tolerances import ANGLE_TOLERANCE, CRITICAL_NORMALS, NORMALS, RANK_TOLERANCE, ROUND_OFF, SPREAD
 
 PI, TURN = math.pi, 2 * math.pi
@@ -241,24 +241,6 @@ def inverse_optimal(k, m, u, ball, C, d, normals, generator, count, none, row_A,
             row_A[k, n, i] = p * C[k, 0, i] + q * C[k, 1, i]
         row_b[k, n] = p * x + q * y + ball
         row_source[k, n] = 2 * m if generator[n] == none else m + generator[n] % m
-
-
-@item
-@no_type_check
-def clipped_inverse_optimal(
-    k, m, u, ball, drift, C, d, clip, normals, generator, count, none, work, row_A, row_b, row_source
-):
-    """The rows of `identification.inverse_optimal_set` for a clipped nominal control that are not padding."""
-    found_A, found_b, found_of = work[-1]
-    is_bounded = count > 0 and generator[0] == none
-    found = unclipped(k, C, d, u, ball, drift, clip, normals, count, is_bounded, work)
-    for n in range(found):
-        p, q, of = found_A[n, 0], found_A[n, 1], found_of[n]
-        for i in range(2):
-            row_A[k, n, i] = p * C[k, 0, i] + q * C[k, 1, i]
-        room = drift if p != 0 or q != 0 else 0.0
-        row_b[k, n] = found_b[n] + room - p * d[k, 0] - q * d[k, 1]
-        row_source[k, n] = 2 * m if of < 0 or generator[of] == none else m + generator[of] % m
 
 
 @launcher

@@ -83,10 +83,10 @@ def is_beyond(wishes, n, distance):
 @item
 @no_type_check
 def is_admissible(normals, b, count, x, y, tolerance):
-    for i in range(count):
-        if normals[i, 0] * x + normals[i, 1] * y - b[i] > tolerance:
-            return False
-    return True
+    i = 0
+    while i < count and normals[i, 0] * x + normals[i, 1] * y - b[i] <= tolerance:
+        i += 1
+    return i == count
 
 
 @item
@@ -137,13 +137,18 @@ def touch_face(normals, b, count, p, q, v, half):
 @item
 @no_type_check
 def add_vertices(x, y, r, v, w, by_norm, normals, count, is_bounded, points, n):
-    """Add the vertices of Q around u = (x, y) that are within the limits v, w to n points. Returns their number."""
+    """Add the vertices of Q around u = (x, y) that are within the limits v, w to n points. Returns their number.
+
+    All neighbouring rows of Q are the same angle apart.
+    """
+    cos = normals[0, 0] * normals[1, 0] + normals[0, 1] * normals[1, 1]
+    if count < 2 or cos <= 0:  # a half-plane, or a strip
+        return n
+    share = r / (1 + cos)
     for i in range(count if is_bounded else count - 1):
         j = i + 1 if i < count - 1 else 0
-        cos = normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1]
-        share = r / (1 + cos)
         p, q = x + share * (normals[i, 0] + normals[j, 0]), y + share * (normals[i, 1] + normals[j, 1])
-        if cos > 0 and is_within(p, q, v, w, by_norm):  # opposite rows do not meet
+        if is_within(p, q, v, w, by_norm):
             points[n, 0], points[n, 1] = p, q
             n += 1
     return n
@@ -168,10 +173,10 @@ def support(points, n, p, q):
 @item
 @no_type_check
 def is_polar(outward, K, p, q):
-    for i in range(K):
-        if p * outward[i, 0] + q * outward[i, 1] > ANGLE_TOLERANCE:
-            return False
-    return True
+    i = 0
+    while i < K and p * outward[i, 0] + q * outward[i, 1] <= ANGLE_TOLERANCE:
+        i += 1
+    return i == K
 
 
 @item
@@ -268,3 +273,21 @@ def unclipped(k, C, d, u, r, margin, clip, normals, count, is_bounded, work):
         for i in range(R):
             row_b[i] = max(row_b[i], dead_speed)
     return R
+
+
+@item
+@no_type_check
+def clipped_inverse_optimal(
+    k, m, u, ball, drift, C, d, clip, normals, generator, count, none, work, row_A, row_b, row_source
+):
+    """The rows of `identification.inverse_optimal_set` for a clipped nominal control that are not padding."""
+    found_A, found_b, found_of = work[-1]
+    is_bounded = count > 0 and generator[0] == none
+    found = unclipped(k, C, d, u, ball, drift, clip, normals, count, is_bounded, work)
+    for n in range(found):
+        p, q, of = found_A[n, 0], found_A[n, 1], found_of[n]
+        for i in range(2):
+            row_A[k, n, i] = p * C[k, 0, i] + q * C[k, 1, i]
+        room = drift if p != 0 or q != 0 else 0.0
+        row_b[k, n] = found_b[n] + room - p * d[k, 0] - q * d[k, 1]
+        row_source[k, n] = 2 * m if of < 0 or generator[of] == none else m + generator[of] % m
