@@ -195,8 +195,9 @@ class Arena(_OfNoBody):
         return Halfspaces(torch.cat([identity, -identity]).expand(*h.shape, len(self.lower)), self.class_k(h))
 
     def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
-        h = self._distances(measurement.x)
-        return RowErrors(torch.zeros_like(h), self.class_k(h) - self.class_k(h - bounds.position.unsqueeze(-1)))
+        h, e = self._distances(measurement.x), bounds.position.unsqueeze(-1)
+        nearer, here, further = (self.class_k(distance) for distance in (h - e, h, h + e))
+        return RowErrors(torch.zeros_like(h), torch.maximum(here - nearer, further - here))
 
     def labels(self, bodies: Sequence[str]) -> list[str]:
         return [f"wall {sign}{axis}" for sign in "+-" for axis in "xyz"[: len(self.lower)]]
