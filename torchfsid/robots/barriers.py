@@ -24,7 +24,7 @@ from torchfsid.robots.measurement import Measurement
 
 @runtime_checkable
 class Barrier(Protocol):
-    """Rows over the control u.
+    """Rows over the control u. docs/your_own_controller.md writes one, `torchfsid.testing` tries any.
 
     Two more members are optional. Where one is missing and matters for a sample, the sample is skipped.
 
