@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -202,6 +202,39 @@ def test_robots_of_second_order() -> None:
     check_derivative(barrier, steady, h=first, alpha=lambda value: k2 * value, motion=second_order)
     with pytest.raises(BarrierError, match="not dh/dt"):
         check_derivative(barrier, steady, h=first, alpha=lambda value: k1 * value, motion=second_order)
+
+
+class Disc:
+    """|u| <= limit as the row (u/|u|).u <= limit, whose direction is wrong as that of u is."""
+
+    soft, uncertain, neighbour_velocity = False, True, "none"
+
+    def __init__(self, told: float):
+        self.told = told
+
+    def __call__(self, measurement: fsid.Measurement) -> Halfspaces:
+        assert measurement.u is not None
+        tangent = torch.nn.functional.normalize(measurement.u, dim=-1).unsqueeze(-2)
+        return Halfspaces(tangent, torch.full_like(tangent[..., 0], 0.6))
+
+    def errors(self, measurement: fsid.Measurement, bounds: ErrorBounds) -> RowErrors:
+        assert measurement.u is not None
+        sine = bounds.control / measurement.u.norm(dim=-1)
+        angle = torch.where(sine < 1, self.told * sine.clamp(max=1.0).arcsin(), math.pi).unsqueeze(-1)
+        return RowErrors(angle, torch.zeros_like(angle))
+
+    def slack_left_out(self, measurement: fsid.Measurement) -> Tensor:
+        return torch.full_like(measurement.x[..., 0], math.inf)
+
+    def labels(self, bodies: Sequence[str]) -> list[str]:
+        return ["disc"]
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_rows_that_depend_on_the_control() -> None:
+    check_barrier(Disc(1.0))
+    with pytest.raises(BarrierError, match=r"check_errors: .*rad off(?s:.)*check_soundness: .*the truth is outside"):
+        check_barrier(Disc(0.98))
 
 
 def test_robots_that_take_the_least_violation() -> None:

@@ -135,20 +135,20 @@ def motions(barrier: Barrier, situations: Measurement, draw: torch.Generator) ->
     """
     speed = 0.1 * (5 * uniform(situations.x[:, :1], draw)).exp()
     wish = speed * direction(situations.x, draw)
-    relaxes, now = getattr(barrier, "relaxes", False), replace(situations, u=wish)
-    for _ in range(10):
-        rows, before = barrier(now), now.u
+    relaxes, u, settled = getattr(barrier, "relaxes", False), wish, torch.zeros_like(wish[:, 0], dtype=torch.bool)
+    for _ in range(5):
+        rows = barrier(replace(situations, u=u))
         solution = solve_safe_qp(rows, wish)
-        u, solved = solution.u, solution.feasible
+        found, solved = solution.u, solution.feasible
         if relaxes and not bool(solved.all()):
             least = inscribed_ball(rows)
-            u = torch.where(solved.unsqueeze(-1), u, least.centre)
+            found = torch.where(solved.unsqueeze(-1), found, least.centre)
             solved = solved | (least.status == ProgrammeStatus.EMPTY)
-        now = replace(now, u=u)
-        assert before is not None
-        settled = solved & ((u - before).norm(dim=-1) <= 1e-12 * (1 + u.norm(dim=-1)))
+        now_settled = solved & ((found - u).norm(dim=-1) <= 1e-12 * (1 + u.norm(dim=-1)))
+        u = torch.where(settled.unsqueeze(-1), u, found)  # a second look may unsettle: tangents of a disc turn with u
+        settled = settled | now_settled
     kept = settled.nonzero().flatten()
-    return now.select(kept), wish[kept]
+    return replace(situations, u=u).select(kept), wish[kept]
 
 
 def of_tensors(measurement: Measurement, change: Callable[[str, Tensor], Tensor]) -> Measurement:
