@@ -205,8 +205,7 @@ def check_left_out(barrier: Barrier, situations: Measurement, seed: int = 0) -> 
 def check_soundness(barrier: Barrier, situations: Measurement, seed: int = 0) -> None:
     """The true parameter is in the set that a measurement gives, and no alarm is false.
 
-    The robots solve their QP at the truth. Where a barrier `relaxes`, those without a solution take the least
-    violation.
+    The robots want random velocities and solve their QP at the truth.
     """
     held = 0
     for text, true, theta, read in _readings("check_soundness", barrier, situations, seed):

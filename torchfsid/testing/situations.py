@@ -8,12 +8,11 @@ from dataclasses import fields, replace
 import torch
 from torch import Tensor
 
-from torchfsid.outcome import ProgrammeStatus
-from torchfsid.programmes.differentiable import inscribed_ball
 from torchfsid.robots.barriers import Barrier
 from torchfsid.robots.bounds import NoiseBound
-from torchfsid.robots.controller import solve_safe_qp
+from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.tasks import VelocityTask
 
 DRAWS = 20
 """Measurements of each situation, in checks of what is random."""
@@ -130,25 +129,12 @@ def on_boundary(
 def motions(barrier: Barrier, situations: Measurement, draw: torch.Generator) -> tuple[Measurement, Tensor]:
     """What robots do that want random velocities, from slow to very fast ones, and these velocities.
 
-    They solve their QP. Where a barrier `relaxes`, those without a solution take the least violation. Robots whose rows
-    depend on the control and do not settle are left out.
+    Robots whose QP has no solution are left out, unless they take the least violation (`Barrier.relaxes`).
     """
-    speed = 0.1 * (5 * uniform(situations.x[:, :1], draw)).exp()
-    wish = speed * direction(situations.x, draw)
-    relaxes, u, settled = getattr(barrier, "relaxes", False), wish, torch.zeros_like(wish[:, 0], dtype=torch.bool)
-    for _ in range(5):
-        rows = barrier(replace(situations, u=u))
-        solution = solve_safe_qp(rows, wish)
-        found, solved = solution.u, solution.feasible
-        if relaxes and not bool(solved.all()):
-            least = inscribed_ball(rows)
-            found = torch.where(solved.unsqueeze(-1), found, least.centre)
-            solved = solved | (least.status == ProgrammeStatus.EMPTY)
-        now_settled = solved & ((found - u).norm(dim=-1) <= 1e-12 * (1 + u.norm(dim=-1)))
-        u = torch.where(settled.unsqueeze(-1), u, found)  # a second look may unsettle: tangents of a disc turn with u
-        settled = settled | now_settled
-    kept = settled.nonzero().flatten()
-    return replace(situations, u=u).select(kept), wish[kept]
+    wish = 0.1 * (5 * uniform(situations.x[:, :1], draw)).exp() * direction(situations.x, draw)
+    control = CbfQpController(VelocityTask(), [barrier])(replace(situations, u=None), wish)
+    moves = control.feasible | (control.u != 0).any(-1)
+    return replace(situations, u=control.u).select(moves), wish[moves]
 
 
 def of_tensors(measurement: Measurement, change: Callable[[str, Tensor], Tensor]) -> Measurement:
