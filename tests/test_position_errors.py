@@ -82,8 +82,8 @@ def test_row_errors_hold_at_the_corners_of_the_errors() -> None:
             measured, rows = barrier(seen).normalised(), barrier(true).normalised()
             cosine = (rows.A * measured.A).sum(-1).clamp(-1, 1)
             assert (cosine.arccos() <= told.angle + 1e-7).all()
-            # Only one side matters: an active row must not be measured as far from active.
-            assert (measured.slack(u) - rows.slack(u) <= told.slack + 1e-9).all()
+            # An active row is not measured as further from active, one that is kept not as further violated.
+            assert ((measured.slack(u) - rows.slack(u)).abs() <= told.slack + 1e-9).all()
 
 
 @pytest.mark.parametrize(

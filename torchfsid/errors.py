@@ -43,6 +43,10 @@ class InconsistentError(FsidError):
         self.robot, self.t, self.rows = robot, t, rows
 
 
+class BarrierError(FsidError, AssertionError):
+    """A barrier breaks promises of its protocol. The message names the checks, the rows and the numbers."""
+
+
 class SolverError(FsidError):
     """A third-party solver failed; the original exception is the cause."""
 

@@ -126,7 +126,8 @@ class CollisionAvoidance:
     def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
         """Bounds on the errors of the rows, with r = |dx| known up to e.
 
-        The boundary phi(r) = alpha(h)/|dh/dx| grows with r and is wrong by at most phi(r) - phi(r - e).
+        The boundary phi(r) = alpha(h)/|dh/dx| grows with r. It is wrong by at most phi(r) - phi(r - e) or
+        phi(r + e) - phi(r), whichever is larger.
 
         Raises:
             InputError: class_k.power < 1/2 with squared distances: phi would not be monotone.
@@ -135,8 +136,9 @@ class CollisionAvoidance:
         sight, present = self.sight(measurement, bounds, self.geometry(measurement)), measurement.present
         r = torch.where(sight.clear, sight.r, 1.0)
         Ds = self._safety_distance(measurement.radius, measurement.body_radii)
-        nearer = (r - torch.where(sight.clear, sight.e, 0.0)).clamp(min=1e-9)
-        moved = self._boundary(r, Ds) - self._boundary(nearer, Ds)
+        e = torch.where(sight.clear, sight.e, 0.0)
+        nearer, here, further = (self._boundary(at, Ds) for at in ((r - e).clamp(min=1e-9), r, r + e))
+        moved = torch.maximum(here - nearer, further - here)
         slack = torch.where(sight.clear, moved, math.inf) + sight.loose
         return RowErrors(torch.where(present, sight.angle, 0.0), torch.where(present, slack, 0.0))
 

@@ -24,7 +24,7 @@ from torchfsid.robots.measurement import Measurement
 
 @runtime_checkable
 class Barrier(Protocol):
-    """Rows over the control u.
+    """Rows over the control u. docs/your_own_controller.md writes one, `torchfsid.testing` tries any.
 
     Two more members are optional. Where one is missing and matters for a sample, the sample is skipped.
 
@@ -195,8 +195,9 @@ class Arena(_OfNoBody):
         return Halfspaces(torch.cat([identity, -identity]).expand(*h.shape, len(self.lower)), self.class_k(h))
 
     def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
-        h = self._distances(measurement.x)
-        return RowErrors(torch.zeros_like(h), self.class_k(h) - self.class_k(h - bounds.position.unsqueeze(-1)))
+        h, e = self._distances(measurement.x), bounds.position.unsqueeze(-1)
+        nearer, here, further = (self.class_k(distance) for distance in (h - e, h, h + e))
+        return RowErrors(torch.zeros_like(h), torch.maximum(here - nearer, further - here))
 
     def labels(self, bodies: Sequence[str]) -> list[str]:
         return [f"wall {sign}{axis}" for sign in "+-" for axis in "xyz"[: len(self.lower)]]

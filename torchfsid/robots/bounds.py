@@ -125,7 +125,8 @@ class RowErrors(NamedTuple):
 
     Attributes:
         angle: bound on the error of each row's direction [rad]. From pi on, the direction is unknown.
-        slack: the additional slack with which an active row may be measured [m/s]. Infinite if unknown.
+        slack: the additional slack with which an active row may be measured, and the violation with which a row that is
+            kept may be measured [m/s]. Infinite if unknown.
     """
 
     angle: Float[Tensor, "*batch m"]

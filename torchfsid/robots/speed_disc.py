@@ -66,7 +66,7 @@ class SpeedDisc:
         speed = measurement.u.norm(dim=-1, keepdim=True)
         moves = speed > 0
         direction = torch.where(moves, measurement.u / torch.where(moves, speed, 1.0), 0.0)
-        return Halfspaces(direction.unsqueeze(-2), torch.where(moves, self.limit, 1.0))
+        return Halfspaces(direction.unsqueeze(-2), torch.ones_like(speed).masked_fill(moves, self.limit))
 
     def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
         """asin(delta/|u|), or unknown for |u| <= delta. The slack itself, limit - |u|, is as exact as u."""
