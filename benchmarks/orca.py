@@ -3,8 +3,8 @@
 The whole observer update for fleets of ORCA robots with 10 neighbours each: rows from positions and velocities, their
 errors, active set, half-spaces, clipping. The robots go to goals past each other on a square, 4 m^2 each, with clipped
 nominal controls (1 m/s) or linear ones. Their controls are those of `CbfQpController` with the same barrier. One
-thread. The search of the neighbours and the controllers are not part of the observer. Exact data (declared bound 1e-5 m/s), and
-positions that are wrong by up to 5 mm.
+thread. The search of the neighbours and the controllers are not part of the observer. Data are exact (declared bound
+1e-5 m/s), or positions are wrong by 5 mm.
 
 The peer is the same observer in torch, on the same measurements in the same run.
 """

@@ -51,8 +51,8 @@ from torchfsid.robots.velocity_obstacle import (
 )
 
 RELAXED = 0.02
-"""Where rows are violated, the control counts as on the speed limit if it is this close to it, relative to the limit.
-The least violation may be at a corner of nearly opposite rows, which single precision moves by up to 1 % of the speed."""
+"""Where rows are violated, a control this close to the speed limit, relative to it, counts as on the limit. The least
+violation may be at a corner of nearly opposite rows, which single precision moves by up to 1 % of the speed."""
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,7 @@ class Geometry(NamedTuple):
 def geometry(pairs: Pairs, time_horizon: float, time_step: float) -> Geometry:
     """The rows of pairs, and what decides about their branches."""
     touches = pairs.r <= pairs.R
-    T = torch.where(touches, time_step, time_horizon)
+    T = torch.full_like(pairs.r, time_horizon).masked_fill(touches, time_step)
     wx, wy = pairs.wx - pairs.px / T, pairs.wy - pairs.py / T
     of_circle = circle(pairs, wx, wy, T)
     beyond = -(wx * pairs.px + wy * pairs.py) - pairs.R * of_circle.speed
