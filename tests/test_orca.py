@@ -19,7 +19,7 @@ from torchfsid.robots.bounds import ErrorBounds, NoiseBound, RowErrors
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.neighbours import nearest_bodies
-from torchfsid.robots.orca import Orca
+from torchfsid.robots.orca import Orca, OrcaController
 from torchfsid.robots.speed_disc import SpeedDisc
 from torchfsid.robots.tasks import GoalTask, Saturation, VelocityTask
 from torchfsid.sets.feasible_set import FeasibleSet
@@ -61,7 +61,7 @@ def test_controls_are_those_of_rvo2() -> None:
         simulator.do_step()
         theirs = torch.from_numpy(rvo.vectors(simulator, "velocity", agents))
         seen = scene.measurement()
-        control = CbfQpController(VelocityTask(), [scene.orca])(seen, torch.from_numpy(wishes).double())
+        control = OrcaController(VelocityTask(), scene.orca)(seen, torch.from_numpy(wishes).double())
         rows = scene.orca(seen)
         worse = rows.slack(control.u).amin(-1) - rows.slack(theirs).amin(-1)
         errors.append((control.u - theirs).norm(dim=-1)[control.feasible])
@@ -101,7 +101,7 @@ def test_the_control_in_a_disc_is_differentiable() -> None:
     scene = rvo.random_scene(np.random.default_rng(8))
     seen = scene.measurement()
     wish = torch.randn(len(scene.x), 2, dtype=torch.float64, requires_grad=True)
-    controller = CbfQpController(VelocityTask(), [scene.orca])
+    controller = OrcaController(VelocityTask(), scene.orca)
     jacobian = torch.autograd.functional.jacobian(lambda theta: controller(seen, theta).u.sum(0), wish)
     step, direction = 1e-6, torch.randn_like(wish)
     ahead, behind = (controller(seen, (wish + s * direction).detach()).u.sum(0) for s in (step, -step))

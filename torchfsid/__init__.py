@@ -31,7 +31,10 @@ if TYPE_CHECKING:
     from torchfsid.robots.controller import CbfQpController as CbfQpController
     from torchfsid.robots.measurement import Measurement as Measurement
     from torchfsid.robots.neighbours import nearest_bodies as nearest_bodies
+    from torchfsid.robots.orca import Orca as Orca
+    from torchfsid.robots.orca import OrcaController as OrcaController
     from torchfsid.robots.simulation import simulate as simulate
+    from torchfsid.robots.speed_disc import SpeedDisc as SpeedDisc
     from torchfsid.robots.tasks import AffineTask as AffineTask
     from torchfsid.robots.tasks import FormationTask as FormationTask
     from torchfsid.robots.tasks import GoalTask as GoalTask
@@ -61,7 +64,9 @@ _HOME = {
     "robots.controller": ["CbfQpController"],
     "robots.measurement": ["Measurement"],
     "robots.neighbours": ["nearest_bodies"],
+    "robots.orca": ["Orca", "OrcaController"],
     "robots.simulation": ["simulate"],
+    "robots.speed_disc": ["SpeedDisc"],
     "robots.tasks": [
         "AffineTask",
         "FormationTask",

@@ -37,8 +37,10 @@ from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.robots.avoidance import NeighbourVelocity
 from torchfsid.robots.bounds import ErrorBounds, RowErrors
+from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.speed_disc import SpeedDisc
+from torchfsid.robots.tasks import Task
 from torchfsid.robots.velocity_obstacle import (
     Geometry,
     Pairs,
@@ -124,8 +126,8 @@ class Orca:
         open_at = (is_open(look, e, eps) & may_be).nonzero(as_tuple=True)
         if len(open_at[0]):
             some, own = Pairs._make(v[open_at] for v in pairs), Rows._make(v[open_at] for v in rows)
-            at = (v[open_at] for v in (ux, uy, e, eps))
-            wide = over_branches(some, own, *at, self.time_horizon, self.time_step)
+            at, times = (ux[open_at], uy[open_at], e[open_at], eps[open_at]), (self.time_horizon, self.time_step)
+            wide = over_branches(some, own, *at, *times)
             angle, slack = angle.index_put(open_at, wide.angle), slack.index_put(open_at, wide.slack)
         violation = rows.low - rows.nx * ux - rows.ny * uy
         if not bool((must_be == may_be).all()):
@@ -198,3 +200,13 @@ class Orca:
             may_be = may_be & (least <= most.kthvalue(self.count, dim=-1, keepdim=True).values)
             must_be = must_be & (most < least.kthvalue(self.count + 1, dim=-1, keepdim=True).values)
         return may_be, must_be
+
+
+class OrcaController(CbfQpController):
+    """The controller of RVO2: the velocity nearest to the task's that keeps the rows and the speed limit.
+
+    Where no velocity does, it takes the least violation. Its preferred velocity is clip(C theta + d).
+    """
+
+    def __init__(self, task: Task, orca: Orca):
+        super().__init__(task, (orca,))
