@@ -13,7 +13,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from torchfsid.config.barriers import AvoidanceConfig, BarrierConfig
+from torchfsid.config.avoidance import AvoidanceConfig
+from torchfsid.config.barriers import BarrierConfig
 from torchfsid.config.documents import Strict, wrong
 from torchfsid.config.observers import NoiseConfig, PriorConfig, UkfConfig
 from torchfsid.config.quantities import BodyName, NonNegative, Number, PlanarVector, Positive, known

@@ -40,7 +40,6 @@ class Barrier(Protocol):
 
         order                       2 if the controls are accelerations. Default: 1, velocities. It matters where
                                     `neighbour_velocity` is `current`.
-
         rows_within(measurement, bounds)  The rows that may exist, given bounds on the errors of the measurement, where
                                     errors may decide which rows there are. Default: `barrier(measurement)`.
         uncertain                   whether `errors` matter even if positions and other bodies' velocities are exact.
