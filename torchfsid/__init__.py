@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from torchfsid.robots.controller import CbfQpController as CbfQpController
     from torchfsid.robots.measurement import Measurement as Measurement
     from torchfsid.robots.neighbours import nearest_bodies as nearest_bodies
+    from torchfsid.robots.second_order import SecondOrderAvoidance as SecondOrderAvoidance
     from torchfsid.robots.simulation import simulate as simulate
     from torchfsid.robots.tasks import AffineTask as AffineTask
     from torchfsid.robots.tasks import FormationTask as FormationTask
@@ -61,6 +62,7 @@ _HOME = {
     "robots.controller": ["CbfQpController"],
     "robots.measurement": ["Measurement"],
     "robots.neighbours": ["nearest_bodies"],
+    "robots.second_order": ["SecondOrderAvoidance"],
     "robots.simulation": ["simulate"],
     "robots.tasks": [
         "AffineTask",

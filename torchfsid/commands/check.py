@@ -161,7 +161,8 @@ class Check:
         if self._unexplained:
             return (
                 f"the log contradicts the declared model: no {self.quantity} bound up to "
-                f"{self.fastest:.3g} {self.unit}, the largest {LARGEST_OF[self.quantity]}, explains {', '.join(self._unexplained)}; suspect {SUSPECTS}"
+                f"{self.fastest:.3g} {self.unit}, the largest {LARGEST_OF[self.quantity]}, "
+                f"explains {', '.join(self._unexplained)}; suspect {SUSPECTS}"
             )
         share = replace(self.bound, bound=self.smallest_bound).compared()
         smallest = f"{self.quantity} >= {self.smallest_bound:.3g} {self.unit}"

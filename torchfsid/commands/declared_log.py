@@ -167,7 +167,7 @@ class DeclaredLog:
         return dict(zip(self.robots, consistency.smallest_bounds(consistency.fastest).tolist(), strict=True))
 
 
-def automatic_bound(smallest: Mapping[str, float], quantity: str) -> float:
+def automatic_bound(smallest: Mapping[str, float], quantity: str = "velocity") -> float:
     """The bound that `auto` takes.
 
     Args:

@@ -83,9 +83,10 @@ class JudgedBound:
             f"if the errors are not that large, suspect {SUSPECTS}" if is_needed else "declare a smaller one, or auto"
         )
         if self.differences > self.bound:
-            advice = "most of it are differences of velocities: log accelerations (ax, ay), or more exact velocities"
+            advice = "most of it comes from differences of velocities: log accelerations, or more exact velocities"
+        total = self.bound + self.differences
         return (
-            f"the bound {self.bound + self.differences:.3g} {self.unit} is useless: it is {self.compared()} (the largest: "
+            f"the bound {total:.3g} {self.unit} is useless: it is {self.compared()} (the largest: "
             f"{self.largest:.3g}), so that a wrong model explains the log as well as the right one; {advice}"
         )
 

@@ -6,7 +6,7 @@ import math
 import reprlib
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from pydantic import field_validator, model_validator
 
@@ -116,7 +116,7 @@ class _ObservedErrors(_Errors):
         """The bound on the error of controls."""
         return getattr(self, self.quantity)
 
-    def with_control(self, bound: float) -> Self:
+    def with_control(self, bound: float) -> _ObservedErrors:
         """The same bounds with another one on the error of controls."""
         return self.model_copy(update={self.quantity: bound})
 
@@ -128,7 +128,7 @@ class _ObservedErrors(_Errors):
         """
         if self.control == "auto":
             raise ConfigError(f"noise.{self.quantity}: expected a number, got 'auto'")
-        return self.with_control(self.control)._built()
+        return self._built()
 
     def build_others(self) -> NoiseBound:
         """The same with zero in place of the bound on controls."""

@@ -164,6 +164,11 @@ class Measurement:
         )
 
     @property
+    def is_second_order(self) -> bool:
+        """Are the controls accelerations?"""
+        return self.body_accelerations is not None
+
+    @property
     def time(self) -> float:
         """The common time of all robots [s].
 

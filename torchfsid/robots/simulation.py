@@ -213,8 +213,9 @@ def simulate(
     states = []
 
     def surroundings(t: float, x: Tensor, v: Tensor) -> Measurement:
-        states.append((with_obstacles(x, standing), with_obstacles(v, at_rest)))
-        return _of_teams(t, *states[-1], None, robots, radius, velocity is not None)
+        x, v = with_obstacles(x, standing), with_obstacles(v, at_rest)
+        states.append((x, v))
+        return _of_teams(t, x, v, None, robots, radius, velocity is not None)
 
     samples = list(closed_loop(controller, theta, start, surroundings, dt=dt, samples=steps + 1, velocity=velocity))
     controls = [sample.control for sample in samples]
