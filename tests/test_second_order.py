@@ -17,7 +17,8 @@ from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.identification.evidence import ObservationModel, evidence
 from torchfsid.observers.set_membership import SetMembershipObserver
-from torchfsid.outcome import Status
+from torchfsid.observers.ukf import ParameterUkf
+from torchfsid.outcome import FilterStatus, Status
 from torchfsid.robots.affine_barrier import AffineBarrier
 from torchfsid.robots.barriers import SpeedBox
 from torchfsid.robots.bounds import ErrorBounds, NoiseBound
@@ -198,6 +199,19 @@ def test_a_velocity_loop_is_a_goal_task_of_u() -> None:
         within = evidence(ObservationModel(inner, [told], noise=NoiseBound(1e-3)), prior(4), w)
         sets = [prior(4).intersect(found.omega).volume() for found in (outer, within)]
         torch.testing.assert_close(*sets)
+
+
+@pytest.mark.parametrize("inside", [False, True])
+@pytest.mark.parametrize("task", TASKS)
+def test_the_filter(task: str, inside: bool) -> None:
+    """It takes the velocities for its state, which the accelerations change."""
+    goals, run = crossing(task, "none", 1)
+    corner = torch.full((4, 2), 4.0, dtype=torch.float64)
+    ukf = ParameterUkf.from_prior(TASKS[task], barriers_of("none"), -corner, corner, qp_inside=inside)
+    for k in range(len(run.t)):
+        estimate = ukf.update(run.measurement(k))
+    assert (estimate.status == FilterStatus.OK).all()
+    assert (estimate.theta - goals).norm(dim=-1).median() < 0.2
 
 
 def test_bodies_left_out_are_proved_inactive() -> None:
