@@ -86,6 +86,13 @@ class DeclaredLog:
                 "velocity: 'logged', but the log has no accelerations ax, ay (use 'differentiated': they are then "
                 "differences of velocities)"
             )
+        _, known = self.log.controls
+        joint = "current" in self.config.neighbour_velocities and self.config.velocity == "logged"
+        for j, body in enumerate(self.log.bodies):
+            if not self.log.velocity_known[:, j].any():
+                raise ConfigError(f"dynamics: a double_integrator avoids bodies of known velocities, {body!r} has none")
+            if joint and not known[:, j].any():
+                raise ConfigError(f"barriers: rows use the accelerations of all bodies, and {body!r} has none")
 
     @property
     def row_labels(self) -> list[str]:
