@@ -260,6 +260,7 @@ REFUSED = {
     "damping and loop": ({"task": {**LOOP["task"], "damping": 1.0}}, "task.velocity_loop: expected damping or"),
     "damped dead zone": ({"task": {**CONFIG["task"], "dead_zone": 0.1}}, "task.dead_zone: expected none with damping"),
     "task": ({"task": {"kind": "velocity"}}, "task.kind: expected 'goal' with dynamics: double_integrator"),
+    "law": ({"task": {"kind": "goal", "law": "constant_speed", "speed": 1, "tolerance": 0.1}}, "task.law: expected"),
     "bound": ({"noise": {"acceleration": -1}}, "noise.acceleration: expected a bound of at least 0 m/s2 or 'auto'"),
 }  # fmt: skip
 

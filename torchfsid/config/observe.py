@@ -113,6 +113,8 @@ class ObserveConfig(Strict):
         second, dynamics = self.is_second_order, f"dynamics: {self.dynamics}"
         if second and self.task.kind != "goal":
             raise wrong(f"expected 'goal' with {dynamics}, got {self.task.kind!r}", "task.kind")
+        if second and getattr(self.task, "law", "proportional") != "proportional":
+            raise wrong(f"expected 'proportional' with {dynamics}", "task.law")
         if not second and self.task.needs_velocity is not None:
             raise wrong("needs dynamics: double_integrator", f"task.{self.task.needs_velocity}")
         for i, barrier in enumerate(self.barriers):

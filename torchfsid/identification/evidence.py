@@ -266,7 +266,6 @@ def _sample(model: ObservationModel, theta: FeasibleSet, measurement: Measuremen
         if measurement.position_error is not None:
             error = error + measurement.position_error
         usable = usable & left_out_inactive(model.barriers, within_bounds(measurement, noise), largest, error)
-
     feedback = feedback_of(model.task, measurement)
     if feedback is not None:  # what is clipped is w = u - feedback, and A u <= b is A w <= b - A feedback
         known = feedback.isfinite().all(-1)
