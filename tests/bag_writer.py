@@ -12,7 +12,7 @@ import yaml
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from torchfsid.logs.bags import ODOMETRY, POSE, TRANSFORMS
+from torchfsid.logs.bags import ACCELERATION, ODOMETRY, POSE, TRANSFORMS
 from torchfsid.logs.log import Log, read_csv
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -66,6 +66,12 @@ def odometry(
 def pose(stamp: int, position: Sequence[float], frame: str = "world") -> object:
     """geometry_msgs/PoseStamped."""
     return TYPES[POSE](header=_header(stamp, frame), pose=_pose(position, UNTURNED))
+
+
+def acceleration(stamp: int, values: Sequence[float], frame: str = "world") -> object:
+    """geometry_msgs/AccelStamped."""
+    accel = TYPES["geometry_msgs/msg/Accel"](linear=_vector("Vector3", values), angular=_vector("Vector3", (0, 0)))
+    return TYPES[ACCELERATION](header=_header(stamp, frame), accel=accel)
 
 
 def transforms(stamp: int, positions: Mapping[str, Sequence[float]], frame: str = "world") -> object:

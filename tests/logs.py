@@ -12,14 +12,15 @@ from torchfsid.robots.simulation import Trajectory
 
 
 def write_log(path: Path, run: Trajectory, bodies: Sequence[str], errors: Tensor | None = None) -> Path:
-    """A run as CSV, with errors (samples, bodies, 2) added to its velocities."""
+    """A run as CSV, with errors (samples, bodies, 2) added to its controls."""
     u = run.u if errors is None else run.u + errors
+    columns = {"x": run.x, "v": u} if run.velocity is None else {"x": run.x, "v": run.velocity, "a": u}
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["t", "robot", "x", "y", "vx", "vy"])
+        writer.writerow(["t", "robot", "x", "y", "vx", "vy", "ax", "ay"][: 2 + 2 * len(columns)])
         for k, t in enumerate(run.t.tolist()):
             for j, body in enumerate(bodies):
-                writer.writerow([t, body, *run.x[k, j].tolist(), *u[k, j].tolist()])
+                writer.writerow([t, body, *(value for of in columns.values() for value in of[k, j].tolist())])
     return path
 
 

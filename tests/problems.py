@@ -145,7 +145,9 @@ def solve_qp(A: np.ndarray, b: np.ndarray, nominal: np.ndarray) -> np.ndarray:
     norms = np.linalg.norm(A, axis=-1)
     unit = np.ascontiguousarray(A / norms[:, None])
     lower, sense = np.full(len(b), -1e30), np.zeros(len(b), dtype=np.int32)
-    u, _, flag, _ = daqp.solve(np.eye(2), -nominal, unit, b / norms, lower, sense, primal_tol=1e-11, dual_tol=1e-12)
+    u, _, flag, _ = daqp.solve(
+        np.eye(len(nominal)), -nominal, unit, b / norms, lower, sense, primal_tol=1e-11, dual_tol=1e-12
+    )
     assert flag == 1, f"daqp: exit flag {flag}"
     return np.array(u)
 

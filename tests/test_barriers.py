@@ -18,7 +18,7 @@ from torchfsid import (
     SetMembershipObserver,
     simulate,
 )
-from torchfsid.config.barriers import AvoidanceConfig, UnknownClassKConfig
+from torchfsid.config.avoidance import AvoidanceConfig, UnknownClassKConfig
 from torchfsid.errors import ConfigError, InputError
 from torchfsid.robots.affine_barrier import AffineBarrier
 from torchfsid.robots.avoidance import ClassK

@@ -225,7 +225,7 @@ def test_bodies_without_a_slot_are_as_near_as_they_can_be(form: dict) -> None:
     empty = torch.zeros(200, 0, 2, dtype=torch.float64)
     seen = Measurement(
         0.0, torch.zeros(200, 2).double(), u, empty, torch.zeros(200, 0, dtype=torch.bool), empty,
-        radius=radius[:, 0], body_radii=empty[..., 0], left_out=LeftOut(nearest, speed, radius[:, 1]),
+        radius=radius[:, 0], body_radii=empty[..., 0], left_out=LeftOut(nearest, speed, radius[:, 1], speed),
     )  # fmt: skip
     least = AvoidanceWithin(unknown, psi).slack_left_out(seen)
     towards = u / u.norm(dim=-1, keepdim=True)

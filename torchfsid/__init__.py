@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from torchfsid.robots.neighbours import nearest_bodies as nearest_bodies
     from torchfsid.robots.orca import Orca as Orca
     from torchfsid.robots.orca import OrcaController as OrcaController
+    from torchfsid.robots.second_order import SecondOrderAvoidance as SecondOrderAvoidance
     from torchfsid.robots.simulation import simulate as simulate
     from torchfsid.robots.speed_disc import SpeedDisc as SpeedDisc
     from torchfsid.robots.tasks import AffineTask as AffineTask
@@ -65,6 +66,7 @@ _HOME = {
     "robots.measurement": ["Measurement"],
     "robots.neighbours": ["nearest_bodies"],
     "robots.orca": ["Orca", "OrcaController"],
+    "robots.second_order": ["SecondOrderAvoidance"],
     "robots.simulation": ["simulate"],
     "robots.speed_disc": ["SpeedDisc"],
     "robots.tasks": [

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from experiments.runs.config import Count, Text, WholeNumber, require_steps
 from experiments.teams import TeamConfig
-from torchfsid.config.barriers import AvoidanceConfig
+from torchfsid.config.avoidance import AvoidanceConfig
 from torchfsid.config.documents import Strict, wrong
 from torchfsid.config.observers import PriorConfig, UkfConfig
 from torchfsid.config.quantities import NonNegative, Number, PlanarVector, Positive, known

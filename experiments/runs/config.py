@@ -13,7 +13,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from torchfsid.config.barriers import AvoidanceConfig, BarrierConfig
+from torchfsid.config.avoidance import AvoidanceConfig
+from torchfsid.config.barriers import BarrierConfig
 from torchfsid.config.documents import Strict, wrong
 from torchfsid.config.observers import NoiseConfig, PriorConfig, UkfConfig
 from torchfsid.config.quantities import BodyName, NonNegative, Number, PlanarVector, Positive, known
@@ -134,7 +135,11 @@ class ExperimentConfig(Strict):
     def _can_be_simulated(self) -> Self:
         if self.task.is_unknown:
             raise wrong("expected a number, not [low, high]: robots that are simulated have it", "task.gain")
+        if self.task.needs_velocity is not None:
+            raise wrong("robots of experiments are driven by velocities", f"task.{self.task.needs_velocity}")
         for i, barrier in enumerate(self.barriers):
+            if barrier.is_second_order:
+                raise wrong("robots of experiments are driven by velocities", f"barriers[{i}]")
             if barrier.is_unknown:
                 raise wrong("expected numbers, not [low, high]: robots that are simulated have them", f"barriers[{i}]")
         if len(self.prior.lower) != self.task.parameters:

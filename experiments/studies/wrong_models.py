@@ -175,9 +175,7 @@ def ending(belief: Belief, samples: list[Measurement], goals: Tensor, noise: Noi
     ok = observer.status == Status.OK
     silent = ok & ~(observer.feasible_set.contains(goals) & has_truth)
     away = torch.where(silent, (observer.feasible_set.project(goals) - goals).norm(dim=-1), 0.0)
-    consistency = Consistency(
-        samples, belief.task, belief.barriers, prior(goals), neighbour_velocity=noise.neighbour_velocity
-    )
+    consistency = Consistency(samples, belief.task, belief.barriers, prior(goals), others=noise)
     relaxed = consistency.sets(torch.as_tensor(noise.velocity).expand(len(goals)) / 2).fits
     return Ending(
         flagged=int((~ok).sum()),
@@ -199,7 +197,11 @@ def prior(goals: Tensor) -> FeasibleSet:
 def automatic(belief: Belief, samples: list[Measurement], goals: Tensor, neighbour_velocity: float) -> NoiseBound:
     """The bounds that `velocity: auto` takes, one per run for all its robots."""
     consistency = Consistency(
-        samples, belief.task, belief.barriers, prior(goals), neighbour_velocity=neighbour_velocity
+        samples,
+        belief.task,
+        belief.barriers,
+        prior(goals),
+        others=NoiseBound(0.0, neighbour_velocity=neighbour_velocity),
     )
     smallest = consistency.smallest_bounds(consistency.fastest).unflatten(0, (-1, ROBOTS)).amax(-1)
     # Without such a bound the command ends with an error, which is as good as a flag: take a bound that is refuted.

@@ -1,8 +1,8 @@
 """`torchfsid check`: does a log fit its declared model? Answered from the log alone, without the true parameter.
 
-For each robot: the smallest velocity bound that explains its motion, the residuals of its samples (`consistency`), and
-the rows of the model that contradict samples at the declared bound. For the whole log: whether another alignment of
-velocities with positions fits better, because a shift of one sample breaks the KKT conditions.
+For each robot: the smallest bound on controls that explains its motion, the residuals of its samples (`consistency`),
+and the rows of the model that contradict samples at the declared bound. For the whole log: whether another alignment of
+controls with positions fits better, because a shift of one sample breaks the KKT conditions.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ import torch
 from torch import Tensor
 
 from torchfsid.commands.check_safety import SafetyCheck, check_safety
-from torchfsid.commands.declared_log import AUTO_FACTOR, DeclaredLog
+from torchfsid.commands.declared_log import AUTO_FACTOR, LARGEST_OF, DeclaredLog
 from torchfsid.commands.judged_bound import SUSPECTS, JudgedBound
 from torchfsid.commands.results import constraint_name, seconds
 from torchfsid.observers.consistency import Consistency, Fit
 
 SHIFTS = (-2, -1, 1, 2)
-"""Misalignments of velocities and positions that are looked for [samples]."""
+"""Misalignments of controls and positions that are looked for [samples]."""
 
 BETTER = 0.8
 """Another alignment is better if it needs less than this fraction of the bound."""
@@ -36,7 +36,7 @@ class Fault:
         soft: the controller may violate the row.
         samples: number of such samples.
         first: time of the first [s].
-        worst: largest amount by which a bound is exceeded [m/s].
+        worst: largest amount by which a bound is exceeded, in units of the controls.
     """
 
     row: str
@@ -52,14 +52,16 @@ class Fault:
 
 @dataclass(frozen=True)
 class RobotCheck:
-    """What a robot's motion says about the declared model. A bound or residual is infinite above the largest speed.
+    """What a robot's motion says about the declared model, in units of the controls.
+
+    A bound or residual is infinite above the largest control.
 
     Attributes:
         robot: name of the robot.
-        smallest_bound: the smallest velocity bound that explains the motion [m/s]. NaN if no sample could be used.
-        median: median of the residuals of the samples [m/s].
-        p95: 95th percentile of the residuals [m/s].
-        worst: largest residual [m/s].
+        smallest_bound: the smallest bound that explains the motion. NaN if no sample could be used.
+        median: median of the residuals of the samples.
+        p95: 95th percentile of the residuals.
+        worst: largest residual.
         worst_time: time of the largest residual [s].
         samples: number of samples that say something about theta.
         contradictions: samples that the best Theta cannot explain with the declared bound.
@@ -83,16 +85,18 @@ class Check:
 
     Attributes:
         robots: one entry per robot.
-        declared: the velocity bound of the configuration, or the one that `auto` takes [m/s].
+        quantity: what the controls are, `velocity` or `acceleration`.
+        declared: the bound of the configuration, or the one that `auto` takes.
         is_auto: the configuration says `auto`.
-        fastest: the largest speed in the log [m/s].
-        bound: the larger of the declared and the smallest bound, judged by the speeds seen.
-        shifts: number of samples by which velocities are taken later, to the `smallest_bound` then [m/s]. It is
-            infinite if it is not below that without a shift.
+        fastest: the largest control in the log.
+        bound: the larger of the declared and the smallest bound, judged by the controls seen.
+        shifts: number of samples by which controls are taken later, to the `smallest_bound` then. It is infinite if it
+            is not below that without a shift.
         safety: what the log says about gain and safety distance. None where that is not asked.
     """
 
     robots: tuple[RobotCheck, ...]
+    quantity: str
     declared: float
     is_auto: bool
     fastest: float
@@ -102,12 +106,17 @@ class Check:
 
     @property
     def smallest_bound(self) -> float:
-        """The largest of the robots' smallest bounds [m/s]. NaN if no sample could be used."""
+        """The largest of the robots' smallest bounds. NaN if no sample could be used."""
         return max((robot.smallest_bound for robot in self.robots if robot.samples), default=math.nan)
 
     @property
+    def unit(self) -> str:
+        """The unit of all bounds and residuals."""
+        return self.bound.unit
+
+    @property
     def best_shift(self) -> int:
-        """The number of samples by which later velocities fit clearly better. 0: no shift does."""
+        """The number of samples by which later controls fit clearly better. 0: no shift does."""
         best = min(self.shifts, key=lambda shift: self.shifts[shift])
         return best if self.shifts[best] < BETTER * self.smallest_bound else 0
 
@@ -118,16 +127,17 @@ class Check:
         if len(silent) == len(self.robots):
             return lines
         lines.append(self._fit())
+        controls = {"velocity": "velocities", "acceleration": "accelerations"}[self.quantity]
         if len(self.shifts) == 1:
-            lines.append("nothing can be said of the alignment of velocities and positions: the log is too short")
+            lines.append(f"nothing can be said of the alignment of {controls} and positions: the log is too short")
         elif self.best_shift:
             later = "later" if self.best_shift > 0 else "earlier"
             lines.append(
-                f"velocities logged {abs(self.best_shift)} sample(s) {later} fit better: "
-                f"{self.shifts[self.best_shift]:.3g} m/s suffices; positions and velocities may be misaligned"
+                f"{controls} logged {abs(self.best_shift)} sample(s) {later} fit better: "
+                f"{self.shifts[self.best_shift]:.3g} {self.unit} suffices; positions and {controls} may be misaligned"
             )
         else:
-            lines.append("velocities and positions are aligned: no shift by 1 or 2 samples fits better")
+            lines.append(f"{controls} and positions are aligned: no shift by 1 or 2 samples fits better")
         if self.bound.is_useless and not self._unexplained:
             lines.append(self.bound.warning(is_needed=self.bound.bound <= AUTO_FACTOR * self.smallest_bound))
         for name, faults in (
@@ -138,7 +148,7 @@ class Check:
                 first = min(faults, key=lambda fault: fault.first)
                 most = max({fault.row for fault in faults}, key=lambda row: _count(faults, row))
                 lines.append(
-                    f"{name} at {self.declared:.3g} m/s: {_count(faults)}, the first at {seconds(first.first)} "
+                    f"{name} at {self.declared:.3g} {self.unit}: {_count(faults)}, the first at {seconds(first.first)} "
                     f"({first.row}), most by {most} ({_count(faults, most)})"
                 )
         return lines if self.safety is None else [*lines, self.safety.conclusion()]
@@ -150,11 +160,13 @@ class Check:
     def _fit(self) -> str:
         if self._unexplained:
             return (
-                f"the log contradicts the declared model: no velocity bound up to {self.fastest:.3g} m/s, "
-                f"the largest speed, explains {', '.join(self._unexplained)}; suspect {SUSPECTS}"
+                f"the log contradicts the declared model: no {self.quantity} bound up to "
+                f"{self.fastest:.3g} {self.unit}, the largest {LARGEST_OF[self.quantity]}, "
+                f"explains {', '.join(self._unexplained)}; suspect {SUSPECTS}"
             )
         share = replace(self.bound, bound=self.smallest_bound).compared()
-        line = f"the log is consistent with the declared model for velocity >= {self.smallest_bound:.3g} m/s ({share})"
+        smallest = f"{self.quantity} >= {self.smallest_bound:.3g} {self.unit}"
+        line = f"the log is consistent with the declared model for {smallest} ({share})"
         if self.is_auto:
             return f"{line}; auto takes {self.declared:.3g}"
         line = f"{line}; declared {self.declared:.3g}"
@@ -171,7 +183,7 @@ class Check:
             "smallest_bound": _finite(self.smallest_bound),
             "declared": self.declared,
             "auto": self.is_auto,
-            "largest_speed": self.fastest,
+            f"largest_{LARGEST_OF[self.quantity]}": self.fastest,
             "bound": {"judged": self.bound.bound, **self.bound.to_json()},
             "best_shift": self.best_shift,
             "shifts": {str(shift): _finite(bound) for shift, bound in sorted(self.shifts.items())},
@@ -202,9 +214,9 @@ def check(declared: DeclaredLog) -> Check:
     bounds = consistency.smallest_bounds(fastest)
     enough = bounds.clamp(max=fastest)
     overall = float(enough.max())
-    bound = declared.config.noise.velocity
-    velocity = AUTO_FACTOR * overall if bound == "auto" else bound
-    judged = declared.judged(max(velocity, overall))
+    noise = declared.config.noise
+    bound = AUTO_FACTOR * overall if noise.control == "auto" else noise.control
+    judged = declared.judged(max(bound, overall))
 
     shifts = {0: float(bounds.max())}
     for shift in SHIFTS:
@@ -213,7 +225,7 @@ def check(declared: DeclaredLog) -> Check:
 
     sets = consistency.sets(enough)
     residuals = consistency.residuals(sets, fastest)
-    faults = _Faults(declared.row_labels, consistency, sets, velocity, residuals)
+    faults = _Faults(declared.row_labels, consistency, sets, bound, residuals)
     robots = []
     for i, robot in enumerate(declared.robots):
         of_robot = residuals[:, i]
@@ -233,18 +245,19 @@ def check(declared: DeclaredLog) -> Check:
                 violations=faults.violations(i),
             )
         )
-    return Check(tuple(robots), velocity, bound == "auto", fastest, judged, shifts, check_safety(declared))
+    is_auto, safety = noise.control == "auto", check_safety(declared)
+    return Check(tuple(robots), noise.quantity, bound, is_auto, fastest, judged, shifts, safety)
 
 
 class _Faults:
     """For all samples, at the declared bound: the row that a sample contradicts, and by how much."""
 
-    def __init__(self, labels: Sequence[str], consistency: Consistency, sets: Fit, velocity: float, residuals: Tensor):
+    def __init__(self, labels: Sequence[str], consistency: Consistency, sets: Fit, bound: float, residuals: Tensor):
         self.labels = labels
         at_odds, blamed, excess, measured = [], [], [], []
         for block in consistency.blocks:
-            reading = consistency.read(block, sets, block.repeated(torch.full_like(residuals[0], velocity)))
-            # How far Theta is beyond each half-space [m/s]: rows come from unit normals over the control.
+            reading = consistency.read(block, sets, block.repeated(torch.full_like(residuals[0], bound)))
+            # How far Theta is beyond each half-space, as a control: rows come from unit normals over the control.
             corners = block.repeated(sets.theta.vertices())
             beyond = (reading.omega.A @ corners.mT).amin(-1) - reading.omega.b
             worst = beyond.argmax(-1, keepdim=True)
@@ -256,7 +269,7 @@ class _Faults:
             self.hard = reading.hard
         robots = residuals.shape[1]
         self.times = torch.cat([block.times for block in consistency.blocks])
-        self.over = residuals - velocity
+        self.over = residuals - bound
         self.at_odds = torch.cat(at_odds).unflatten(0, (-1, robots)) & (self.over > 0)
         self.blamed = torch.cat(blamed).unflatten(0, (-1, robots))
         self.excess = torch.cat(excess).unflatten(0, (-1, robots))

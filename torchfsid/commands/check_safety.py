@@ -15,7 +15,7 @@ import torch
 
 from torchfsid.commands.declared_log import DeclaredLog, automatic_bound
 from torchfsid.commands.terminal import ends
-from torchfsid.config.barriers import AvoidanceConfig
+from torchfsid.config.avoidance import AvoidanceConfig
 from torchfsid.identification.safety_parameters import LearningModel, Possible
 from torchfsid.observers.second_look import second_look
 from torchfsid.robots.unknown_avoidance import Interval, UnknownAvoidance
@@ -142,14 +142,14 @@ def check_safety(declared: DeclaredLog) -> SafetyCheck | None:
     around = (stated.lengths[0] / DISTANCE_FACTOR - beside, stated.lengths[0] * DISTANCE_FACTOR - beside)
     anything = stated if barrier.is_unknown else _with(stated, wide, around)
     declared = _with_barrier(declared, places[0], anything)
-    if config.noise.velocity == "auto":
+    if config.noise.control == "auto":
         smallest = declared.smallest_bounds()
         if math.inf in smallest.values():
             return SafetyCheck(what, gain, low, None, None, None, False, True)
-        declared = declared.with_velocity_bound(automatic_bound(smallest))
-    velocity = declared.config.noise.velocity
-    assert velocity != "auto"
-    is_useless = declared.judged(velocity).is_useless
+        declared = declared.with_bound(automatic_bound(smallest, config.noise.quantity))
+    bound = declared.config.noise.control
+    assert bound != "auto"
+    is_useless = declared.judged(bound).is_useless
 
     def learned(unknown: UnknownAvoidance) -> Learned | None:
         return _learned(_with_barrier(declared, places[0], unknown), unknown)

@@ -22,8 +22,12 @@ from torchfsid.robots.unknown_avoidance import UnknownAvoidance
 from torchfsid.sets.feasible_set import FeasibleSet
 
 AUTO_FACTOR = 2.0
-"""`noise.velocity: auto` takes the smallest bound that explains the log this many times: the worst error of a log is
+"""A bound of `auto` takes the smallest bound that explains the log this many times: the worst error of a log is
 not the worst there is, and part of an error may look like another parameter."""
+
+
+LARGEST_OF = {"velocity": "speed", "acceleration": "acceleration"}
+"""What a large control is large in."""
 
 
 @dataclass
@@ -53,17 +57,42 @@ class DeclaredLog:
         config, radius = self.config, None if self.log.radius is None else self.log.radius.tolist()
         if self.log.x.shape[-1] != 2:
             raise ConfigError("task: planar controllers only, but the log has a column z")
-        if config.velocity == "logged" and self.log.u is None:
+        if config.is_second_order:
+            self._require_accelerations()
+        elif config.velocity == "logged" and self.log.u is None:
             raise ConfigError("velocity: 'logged', but the log has no velocities vx, vy (use 'differentiated')")
         if len(self.log.bodies) > 1 and not (self.log.seen.sum(axis=1) > 1).any():
             raise ConfigError(f"{self.log.source}: no two bodies share a time, so none would ever see another")
-        if config.velocity == "differentiated":
-            self.log = self.log.differentiated()
+        if config.is_second_order:
+            noise = config.noise.build_others()
+            self.log = self.log if config.velocity == "logged" else self.log.accelerated(noise.arrival)
+        else:
+            self.log = self.log.of_first_order()
+            self.log = self.log if config.velocity == "logged" else self.log.differentiated()
         self.log = bridged(self.log)
         self.robots = config.robots(self.log.bodies)
         self.task = config.task.build(self.log.bodies)
         self.barriers = config.build_barriers(self.log.bodies, radius)
         self.prior = config.prior.build(len(self.robots))
+
+    def _require_accelerations(self) -> None:
+        if self.log.u is None:
+            raise ConfigError(
+                "dynamics: a double_integrator needs velocities vx, vy, and the log has none: positions alone leave "
+                "velocities and accelerations open, two unknowns for each position"
+            )
+        if self.config.velocity == "logged" and self.log.a is None:
+            raise ConfigError(
+                "velocity: 'logged', but the log has no accelerations ax, ay (use 'differentiated': they are then "
+                "differences of velocities)"
+            )
+        _, known = self.log.controls
+        joint = "current" in self.config.neighbour_velocities and self.config.velocity == "logged"
+        for j, body in enumerate(self.log.bodies):
+            if not self.log.velocity_known[:, j].any():
+                raise ConfigError(f"dynamics: a double_integrator avoids bodies of known velocities, {body!r} has none")
+            if joint and not known[:, j].any():
+                raise ConfigError(f"barriers: rows use the accelerations of all bodies, and {body!r} has none")
 
     @property
     def row_labels(self) -> list[str]:
@@ -75,41 +104,43 @@ class DeclaredLog:
         return self.log.measurements(self.robots, self.config.neighbour_velocities, self.config.required)
 
     def consistency(self) -> Consistency:
-        """What the log says about the velocity bound, under the model and all other declared bounds."""
+        """What the log says about the bound on controls, under the model and all other declared bounds."""
         noise = self.config.noise
-        return Consistency(
-            list(self.measurements()),
-            self.task,
-            self.barriers,
-            self.prior,
-            noise.slack,
-            noise.position,
-            noise.neighbour_velocity,
-        )
+        samples = list(self.measurements())
+        return Consistency(samples, self.task, self.barriers, self.prior, noise.slack, noise.build_others())
 
     def shifted(self, samples: int) -> DeclaredLog:
-        """The same log with velocities taken this number of samples later."""
+        """The same log with controls taken this number of samples later."""
         log, times = self.log, len(self.log.t)
         kept = slice(max(0, -samples), times - max(0, samples))
         moved = slice(max(0, samples), times + min(0, samples))
+        velocities = moved if log.a is None else kept
+
+        def at(part: slice, values: np.ndarray | None) -> np.ndarray | None:
+            return None if values is None else values[part]
+
+        accelerated = log.acceleration_known
         shifted = replace(
             log,
             t=log.t[kept],
             x=log.x[kept],
-            u=None if log.u is None else log.u[moved],
+            u=at(velocities, log.u),
+            a=at(moved, log.a),
             seen=log.seen[kept],
-            velocity_known=log.velocity_known[moved] & log.seen[kept],
-            position_error=None if log.position_error is None else log.position_error[kept],
-            velocity_error=None if log.velocity_error is None else log.velocity_error[moved],
-            lost=None if log.lost is None else log.lost[kept],
+            velocity_known=log.velocity_known[velocities] & log.seen[kept],
+            acceleration_known=None if accelerated is None else accelerated[moved] & log.seen[kept],
+            position_error=at(kept, log.position_error),
+            velocity_error=at(velocities, log.velocity_error),
+            acceleration_error=at(moved, log.acceleration_error),
+            lost=at(kept, log.lost),
             bridged=None if log.bridged is None else log.bridged[kept] | log.bridged[moved],
         )
         return replace(self, config=self.config.model_copy(update={"velocity": "logged"}), log=shifted)
 
-    def with_velocity_bound(self, bound: float) -> DeclaredLog:
-        """The same log and model with `noise.velocity` = `bound` [m/s]."""
+    def with_bound(self, bound: float) -> DeclaredLog:
+        """The same log and model with another bound on the error of controls."""
         other = copy(self)
-        other.config = self.config.with_velocity_bound(bound)
+        other.config = self.config.with_bound(bound)
         return other
 
     def with_task_gain(self, gain: tuple[float, float]) -> DeclaredLog:
@@ -120,26 +151,35 @@ class DeclaredLog:
         return other
 
     def judged(self, bound: float) -> JudgedBound:
-        """A velocity bound [m/s], judged by the controls of the inferred robots."""
-        assert self.log.u is not None
+        """A bound on the error of controls, judged by the controls of the inferred robots.
+
+        Accelerations from differences of velocities have errors of their own, of which the median counts.
+        """
+        controls, known = self.log.controls
+        assert controls is not None
         of_robots = [self.log.bodies.index(robot) for robot in self.robots]
-        controls = self.log.u[:, of_robots][self.log.velocity_known[:, of_robots]]
-        return JudgedBound.of(bound, np.linalg.norm(controls, axis=-1))
+        known = known[:, of_robots]
+        sizes = np.linalg.norm(controls[:, of_robots][known], axis=-1)
+        error, differences = self.log.acceleration_error, 0.0
+        if error is not None and len(sizes):
+            differences = float(np.median(error[:, of_robots][known]))
+        return JudgedBound.of(bound, sizes, self.config.noise.unit, differences)
 
     def smallest_bounds(self) -> dict[str, float]:
-        """For each robot, the smallest velocity bound with which the model explains its motion [m/s].
+        """For each robot, the smallest bound on controls with which the model explains its motion.
 
-        It is infinite if no bound up to the largest speed in the log does.
+        It is infinite if no bound up to the largest control in the log does.
         """
         consistency = self.consistency()
         return dict(zip(self.robots, consistency.smallest_bounds(consistency.fastest).tolist(), strict=True))
 
 
-def automatic_bound(smallest: Mapping[str, float]) -> float:
-    """The bound that `noise.velocity: auto` takes [m/s].
+def automatic_bound(smallest: Mapping[str, float], quantity: str = "velocity") -> float:
+    """The bound that `auto` takes.
 
     Args:
-        smallest: each robot's smallest bound [m/s], as `DeclaredLog.smallest_bounds` returns it.
+        smallest: each robot's smallest bound, as `DeclaredLog.smallest_bounds` returns it.
+        quantity: what it bounds, `velocity` or `acceleration`.
 
     Raises:
         ConfigError: one of them is infinite: the model is wrong. `torchfsid check` says where.
@@ -147,7 +187,8 @@ def automatic_bound(smallest: Mapping[str, float]) -> float:
     unexplained = [robot for robot, bound in smallest.items() if bound == math.inf]
     if unexplained:
         raise ConfigError(
-            f"noise.velocity: auto: no bound up to the largest speed in the log explains robot {unexplained[0]!r}; "
+            f"noise.{quantity}: auto: no bound up to the largest {LARGEST_OF[quantity]} in the log explains robot "
+            f"{unexplained[0]!r}; "
             f"the model is wrong (torchfsid check says where): suspect {SUSPECTS}"
         )
     return AUTO_FACTOR * max(smallest.values())

@@ -46,23 +46,23 @@ class HypothesisVerdict:
 class Hypotheses:
     """A log and several models by name, ready to run.
 
-    With `velocity: auto` all hypotheses have the same bound, so that none survives by a larger bound of its own. It is
+    With `auto` all hypotheses have the same bound, so that none survives by a larger bound of its own. It is
     twice the smallest bound with which every robot is explained by some hypothesis.
 
     Raises:
-        ConfigError: some robot is explained by no hypothesis, with any bound up to the largest speed.
+        ConfigError: some robot is explained by no hypothesis, with any bound up to the largest control.
     """
 
     def __init__(self, models: Mapping[str, DeclaredLog]):
         self.smallest_bounds: dict[str, float] | None = None
-        if next(iter(models.values())).config.noise.velocity == "auto":
+        if next(iter(models.values())).config.noise.control == "auto":
             best: dict[str, float] = {}
             for model in models.values():
                 for robot, bound in model.smallest_bounds().items():
                     best[robot] = min(bound, best.get(robot, math.inf))
             self.smallest_bounds = best
-            bound = automatic_bound(best)
-            models = {name: model.with_velocity_bound(bound) for name, model in models.items()}
+            bound = automatic_bound(best, next(iter(models.values())).config.noise.quantity)
+            models = {name: model.with_bound(bound) for name, model in models.items()}
         self.observations = {name: Observation(model) for name, model in models.items()}
 
     @property
@@ -71,13 +71,13 @@ class Hypotheses:
         return sum(observation.samples for observation in self.observations.values())
 
     @property
-    def velocity_bound(self) -> float:
-        """The bound in use [m/s]."""
-        return next(iter(self.observations.values())).velocity_bound
+    def bound_used(self) -> float:
+        """The bound on controls in use."""
+        return next(iter(self.observations.values())).bound_used
 
     @property
     def bound(self) -> JudgedBound:
-        """The same, judged by the speeds seen."""
+        """The same, judged by the controls seen."""
         return next(iter(self.observations.values())).bound
 
     def write_verdicts(self, out: Path) -> None:

@@ -36,26 +36,31 @@ class JudgedBound:
         typical: the typical control [unit].
         largest: the largest control [unit].
         unit: the unit of controls.
+        differences: a further bound, on accelerations that are differences of velocities with errors [unit].
     """
 
     bound: float
     typical: float
     largest: float
     unit: str
+    differences: float = 0.0
 
     @classmethod
-    def of(cls, bound: float, sizes: Float[np.ndarray, "samples"], unit: str = "m/s") -> JudgedBound:
+    def of(
+        cls, bound: float, sizes: Float[np.ndarray, "samples"], unit: str = "m/s", differences: float = 0.0
+    ) -> JudgedBound:
         """Judge a bound by the sizes of the controls that are seen."""
         if not sizes.any():
-            return cls(bound, 0.0, 0.0, unit)
+            return cls(bound, 0.0, 0.0, unit, differences)
         ordered = np.sort(sizes)
         way = np.cumsum(ordered / ordered[-1])
-        return cls(bound, float(ordered[np.searchsorted(way, way[-1] / 2)]), float(ordered[-1]), unit)
+        typical = float(ordered[np.searchsorted(way, way[-1] / 2)])
+        return cls(bound, typical, float(ordered[-1]), unit, differences)
 
     @property
     def share(self) -> float:
         """The bound as a share of the typical control. NaN if nothing moves."""
-        return self.bound / self.typical if self.typical else math.nan
+        return (self.bound + self.differences) / self.typical if self.typical else math.nan
 
     @property
     def is_useless(self) -> bool:
@@ -77,8 +82,11 @@ class JudgedBound:
         advice = (
             f"if the errors are not that large, suspect {SUSPECTS}" if is_needed else "declare a smaller one, or auto"
         )
+        if self.differences > self.bound:
+            advice = "most of it comes from differences of velocities: log accelerations, or more exact velocities"
+        total = self.bound + self.differences
         return (
-            f"the bound {self.bound:.3g} {self.unit} is useless: it is {self.compared()} (the largest: "
+            f"the bound {total:.3g} {self.unit} is useless: it is {self.compared()} (the largest: "
             f"{self.largest:.3g}), so that a wrong model explains the log as well as the right one; {advice}"
         )
 

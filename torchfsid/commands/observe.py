@@ -65,12 +65,12 @@ class Observation:
     """A log and the declared model, ready to run.
 
     Attributes:
-        declared: the log and the model. With `velocity: auto`, with the bound that was determined.
+        declared: the log and the model. With `auto`, with the bound that was determined.
         stated: the configuration to repeat the run with.
         sets: the observer of the sets.
         observer: `sets` alone, or combined with the filter if the configuration has one.
-        smallest_bounds: with `velocity: auto`, each robot's smallest velocity bound that explains its motion [m/s].
-        bound: the velocity bound in use, judged by the speeds seen.
+        smallest_bounds: with `auto`, each robot's smallest bound on controls that explains its motion [`noise.unit`].
+        bound: the bound in use, judged by the controls seen.
         task_gain: where the gain of the task is unknown, the gains that can explain the log.
 
     Raises:
@@ -87,11 +87,12 @@ class Observation:
     _cases: dict[str, Counter[str]] = field(init=False)
 
     def __post_init__(self) -> None:
-        if self.config.noise.velocity == "auto":
+        if self.config.noise.control == "auto":
             self.smallest_bounds = self.declared.smallest_bounds()
-            self.declared = self.declared.with_velocity_bound(automatic_bound(self.smallest_bounds))
+            found = automatic_bound(self.smallest_bounds, self.config.noise.quantity)
+            self.declared = self.declared.with_bound(found)
         self.stated = self.declared.config
-        self.bound = self.declared.judged(self.velocity_bound)
+        self.bound = self.declared.judged(self.bound_used)
         if self.config.task.is_unknown:
             self.declared, self.task_gain = narrowed(self.declared)
         self._cases = {robot: Counter() for robot in self.robots}
@@ -119,13 +120,13 @@ class Observation:
         return len(self.log.t)
 
     @property
-    def velocity_bound(self) -> float:
-        """The bound in use [m/s]."""
-        assert self.config.noise.velocity != "auto"
-        return self.config.noise.velocity
+    def bound_used(self) -> float:
+        """The bound on controls in use [`noise.unit`]."""
+        assert self.config.noise.control != "auto"
+        return self.config.noise.control
 
     def strained(self) -> list[str]:
-        """Robots that end `ok` but need more than half of the velocity bound: it may hide an error of the model.
+        """Robots that end `ok` but need more than half of the bound on controls: it may hide an error of the model.
 
         This is no alarm, since errors may be as large as declared. The list is empty where the question has no meaning
         (the bound was determined from the log, sets are reset, critical regions) or takes too long (theta is not
@@ -136,7 +137,7 @@ class Observation:
             return []
         if sets.prior.dim != 2:
             return []
-        half = torch.full((len(self.robots),), self.velocity_bound / AUTO_FACTOR, dtype=torch.float64)
+        half = torch.full((len(self.robots),), self.bound_used / AUTO_FACTOR, dtype=torch.float64)
         suffices = self.declared.consistency().sets(half).fits
         needs_more = (sets.status == Status.OK) & ~suffices
         return [robot for robot, strained in zip(self.robots, needs_more.tolist(), strict=True) if strained]
@@ -150,7 +151,7 @@ class Observation:
             FsidError: no parameter explains a robot, and `on_inconsistent` is `raise`. It names robot and rows.
             OSError: a file could not be written. The log was still observed to its end.
         """
-        bound, labels = {"used": self.velocity_bound, **self.bound.to_json()}, self.declared.row_labels
+        bound, labels = {"used": self.bound_used, **self.bound.to_json()}, self.declared.row_labels
         with ResultsWriter(out, self.robots, self.sets, labels=labels, bound=bound) as results:
             for measurement in track(self.declared.measurements()):
                 try:

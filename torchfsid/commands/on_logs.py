@@ -42,12 +42,14 @@ def observe_log(path: Path, models: Mapping[str, ObserveConfig], folder: Results
     run = _ready({name: DeclaredLog(model, log) for name, model in models.items()})
     of_each = run.observations if isinstance(run, Hypotheses) else {"": run}
     files = [f"{name}/{file}" if name else file for name in of_each for file in ("config.yaml", *FILES, *UNKNOWN_FILES)]
-    also = ["velocity_bound.json", *(["hypotheses.json"] if isinstance(run, Hypotheses) else [])]
+    first = next(iter(models.values()))
+    bound_file = f"{first.noise.quantity}_bound.json"
+    also = [bound_file, *(["hypotheses.json"] if isinstance(run, Hypotheses) else [])]
     folder.claim([*files, *also], dump_models({name: of.stated for name, of in of_each.items()}))
     if run.smallest_bounds is not None:
-        found = {"smallest": run.smallest_bounds, "factor": AUTO_FACTOR, "used": run.velocity_bound}
+        found = {"smallest": run.smallest_bounds, "factor": AUTO_FACTOR, "used": run.bound_used}
         found |= run.bound.to_json()
-        write_json(folder.path / "velocity_bound.json", found)
+        write_json(folder.path / bound_file, found)
     problems: list[OSError | FigureError] = []
     for name, observation in of_each.items():
         out = folder.path / name
@@ -96,7 +98,7 @@ def check_log(path: Path, models: Mapping[str, ObserveConfig], folder: ResultsFo
 
 def _ready(models: Mapping[str, DeclaredLog]) -> Observation | Hypotheses:
     first = next(iter(models.values()))
-    auto, gain = first.config.noise.velocity == "auto", any(model.config.task.is_unknown for model in models.values())
-    finding = status("Narrowing the gain" if gain else "Finding the velocity bound", computes=True)
+    auto, gain = first.config.noise.control == "auto", any(model.config.task.is_unknown for model in models.values())
+    finding = status("Narrowing the gain" if gain else "Finding the bound", computes=True)
     with finding if auto or gain else nullcontext():
         return Hypotheses(models) if len(models) > 1 else Observation(first)

@@ -58,10 +58,11 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
         _print_task_gain(observation.task_gain, console)
     if isinstance(observation.sets, SafetyObserver):
         _print_safety(observation.sets, observation.robots, observation.declared.row_labels, console)
-    _print_bound(console, observation.smallest_bounds, observation.bound)
+    noise = observation.config.noise
+    _print_bound(console, observation.smallest_bounds, observation.bound, noise.quantity)
     if strained := observation.strained():
         console.print(
-            f"More than half of noise.velocity, {observation.velocity_bound:g} m/s, is needed by "
+            f"More than half of noise.{noise.quantity}, {observation.bound_used:g} {noise.unit}, is needed by "
             f"{escape(', '.join(strained))}: if the errors are not that large, the model is wrong (torchfsid check)"
         )
     files = ("estimates.csv", "regions.json", "config.yaml", "regions.png", "regions.pdf", "safety.png", "safety.pdf")
@@ -75,7 +76,7 @@ def _print_task_gain(found: TaskGain, console: Console) -> None:
         console.print(f"no gain of the task explains the log ({declared})")
         return
     said = "" if all(found.by_data) else "; * not bounded by the data"
-    console.print(f"gain of the task: {ends(found.found, found.by_data)} 1/s ({declared}{said})")
+    console.print(f"gain of the task: {ends(found.found, found.by_data)} {found.unit} ({declared}{said})")
 
 
 def _print_safety(observer: SafetyObserver, robots: Sequence[str], labels: Sequence[str], console: Console) -> None:
@@ -142,7 +143,8 @@ def print_hypotheses(hypotheses: Hypotheses, out: Path, console: Console) -> Non
         explains_some = bool((sets.status < Status.INCONSISTENT).any())
         if isinstance(sets, SafetyObserver) and sets.team_is_refuted and explains_some:
             console.print(escape(f"{name}: the robots have no safety parameters in common, each has its own"))
-    _print_bound(console, hypotheses.smallest_bounds, hypotheses.bound)
+    quantity = next(iter(hypotheses.observations.values())).config.noise.quantity
+    _print_bound(console, hypotheses.smallest_bounds, hypotheses.bound, quantity)
     console.print(escape(f"Results: {out}/hypotheses.json, and a folder for each of {', '.join(names)}"))
 
 
@@ -166,12 +168,14 @@ def print_check(found: Check, name: str, console: Console) -> None:
         console: where to print.
     """
     robots = table(
-        "smallest velocity bound and residuals [m/s]", ["robot"], ["bound", "median", "p95", "max", "at", "samples"]
+        f"smallest {found.quantity} bound and residuals [{found.unit}]",
+        ["robot"],
+        ["bound", "median", "p95", "max", "at", "samples"],
     )
     faults = table(
-        f"at odds with the declared bounds, velocity {found.declared:.3g} m/s",
+        f"at odds with the declared bounds, {found.quantity} {found.declared:.3g} {found.unit}",
         ["robot", "what", "row"],
-        ["samples", "first", "worst [m/s]"],
+        ["samples", "first", f"worst [{found.unit}]"],
     )
     for robot in found.robots:
         sizes = [_size(size) for size in (robot.smallest_bound, robot.median, robot.p95, robot.worst)]
@@ -195,11 +199,11 @@ def print_check(found: Check, name: str, console: Console) -> None:
         console.print(f"- {escape(conclusion)}", soft_wrap=True)
 
 
-def _print_bound(console: Console, smallest: Mapping[str, float] | None, bound: JudgedBound) -> None:
+def _print_bound(console: Console, smallest: Mapping[str, float] | None, bound: JudgedBound, quantity: str) -> None:
     """Print the bound that `auto` found, and a warning if the bound is useless, found or declared."""
     if smallest is not None:
         robot = max(smallest, key=lambda robot: smallest[robot])
-        found = f"noise.velocity: auto found {smallest[robot]:.3g} {bound.unit} (robot {robot})"
+        found = f"noise.{quantity}: auto found {smallest[robot]:.3g} {bound.unit} (robot {robot})"
         takes = f"takes {bound.bound:.3g} {bound.unit}"
         console.print(escape(f"{found}, {takes}: {bound.compared()}"), soft_wrap=True)
     if bound.is_useless:

@@ -23,14 +23,16 @@ RESOLUTION = 1.005
 
 @dataclass(frozen=True)
 class TaskGain:
-    """The gains that can explain the log [1/s].
+    """The gains that can explain the log.
 
     Attributes:
+        unit: their unit.
         declared: the declared interval.
         found: the interval that is left; the declared one if nothing explains the log.
         explains: whether any gain does.
     """
 
+    unit: str
     declared: tuple[float, float]
     found: tuple[float, float]
     explains: bool
@@ -49,20 +51,20 @@ def narrowed(declared: DeclaredLog) -> tuple[DeclaredLog, TaskGain]:
     """The same log with a narrower interval for the task's gain, and what was found.
 
     Args:
-        declared: a log whose task has an unknown gain, with the velocity bound as a number.
+        declared: a log whose task has an unknown gain, with the bound on controls as a number.
     """
-    task, velocity = declared.config.task, declared.config.noise.velocity
+    task, bound = declared.config.task, declared.config.noise.control
     assert isinstance(task, GoalConfig)
     assert isinstance(task.gain, tuple)
-    assert velocity != "auto"
+    assert bound != "auto"
     consistency, known = declared.consistency(), {}
-    bound = torch.full((consistency.robots,), velocity, dtype=torch.float64)
+    bounds = torch.full((consistency.robots,), bound, dtype=torch.float64)
 
     def fits(low: float, high: float) -> torch.Tensor:
         if (low, high) not in known:
             part = task.model_copy(update={"gain": (low, high)})
             consistency.task = part.build(declared.log.bodies)
-            known[low, high] = consistency.sets(bound, taking_part).fits
+            known[low, high] = consistency.sets(bounds, taking_part).fits
         return known[low, high]
 
     low, high = declared_gain = task.gain[0], task.gain[1]
@@ -84,6 +86,6 @@ def narrowed(declared: DeclaredLog) -> tuple[DeclaredLog, TaskGain]:
 
     ends = end(low, high, True), end(low, high, False)
     if ends[0] is None or ends[1] is None or not bool(taking_part.any()):
-        return declared, TaskGain(declared_gain, declared_gain, False)
-    found = TaskGain(declared_gain, (ends[0], ends[1]), True)
+        return declared, TaskGain(task.gain_unit, declared_gain, declared_gain, False)
+    found = TaskGain(task.gain_unit, declared_gain, (ends[0], ends[1]), True)
     return declared.with_task_gain(found.found), found

@@ -18,11 +18,13 @@ class BagConfig(Strict):
         frames: child frame of a transform on /tf, to the name of the body.
         rate: rate [Hz] of the common clock, best the controllers' rate. It is used only if the bodies' stamps differ.
             Default: the stamps of the first body.
+        accelerations: topic of an AccelStamped, to the name of the body. In the frame of the positions.
         radius: radius of every body [m].
     """
 
     topics: dict[str, BodyName] = Field(default_factory=dict)
     frames: dict[str, BodyName] = Field(default_factory=dict)
+    accelerations: dict[str, BodyName] = Field(default_factory=dict)
     rate: Positive | None = None
     radius: dict[BodyName, NonNegative] | None = None
 
@@ -40,6 +42,9 @@ class BagConfig(Strict):
         for body in bodies:
             if bodies.count(body) > 1:
                 raise wrong(f"{bodies.count(body)} topics or frames are mapped to {body!r}")
+        for topic, body in self.accelerations.items():
+            if body not in bodies or list(self.accelerations.values()).count(body) > 1:
+                raise wrong(f"expected one topic for each of {reprlib.repr(bodies)} at most", f"accelerations.{topic}")
         if self.radius is not None and set(self.radius) != set(bodies):
             raise wrong(
                 f"expected a radius for each of {reprlib.repr(bodies)}, got {reprlib.repr(self.radius)}", "radius"

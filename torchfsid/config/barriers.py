@@ -1,176 +1,29 @@
-"""The barriers in configuration files. Each builds an object of `robots.avoidance` or `robots.barriers`.
+"""The barriers in configuration files. Each builds an object of `robots`.
 
 Each barrier says what it needs from a log: the bodies' radii, and their velocities now or one sample earlier.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
-from itertools import combinations
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
-from torchfsid.config.documents import Strict, wrong
-from torchfsid.config.quantities import (
-    BodyName,
-    Flag,
-    NonNegative,
-    NonNegativeOrInterval,
-    PlanarVector,
-    Positive,
-    PositiveOrInterval,
-    as_interval,
-    known,
-    require_body,
-    require_box,
-    require_interval,
-)
+from torchfsid.config.avoidance import AvoidanceConfig, ClassKConfig, SecondOrderAvoidanceConfig
+from torchfsid.config.documents import Strict
+from torchfsid.config.quantities import Flag, NonNegative, PlanarVector, Positive, require_box
 from torchfsid.errors import ConfigError
 
 if TYPE_CHECKING:
-    from torchfsid.robots.avoidance import ClassK
     from torchfsid.robots.barriers import Barrier
-    from torchfsid.robots.unknown_avoidance import UnknownAvoidance
-
-
-class UnknownClassKConfig(Strict):
-    """`ClassKConfig` whose gain may be unknown within [low, high]."""
-
-    gain: PositiveOrInterval
-    power: Positive = 1.0
-
-    @model_validator(mode="after")
-    def _is_ordered(self) -> UnknownClassKConfig:
-        require_interval("gain", self.gain)
-        return self
-
-
-class ClassKConfig(Strict):
-    """`ClassK`: alpha(h) = gain sign(h) |h|^power."""
-
-    gain: Positive
-    power: Positive = 1.0
-
-    def build(self) -> ClassK:
-        """The `ClassK` with these values."""
-        from torchfsid.robots.avoidance import ClassK
-
-        return ClassK(self.gain, self.power)
-
-
-class AvoidanceConfig(Strict):
-    """`CollisionAvoidance`, by `safety_distance`, or by `margin` if the log has radii. Exactly one of the two is given.
-
-    Gain, safety distance and margin may be unknown within [low, high]. Then this is an `UnknownAvoidance`.
-
-    Attributes:
-        distance: form of h, see `robots.avoidance`.
-        safety_distance: distance between centres [m].
-        safety_distances: distances to single bodies that replace `safety_distance` [m].
-        margin: distance between the discs of two bodies [m].
-        class_k: the function alpha of the barrier.
-        neighbour_velocity: which velocities of other bodies the rows use.
-        soft: the controller may violate the rows.
-        shared: whether unknown values are those of the whole team, or of each robot.
-    """
-
-    kind: Literal["avoidance"] = "avoidance"
-    distance: Literal["squared", "euclidean"] = "squared"
-    safety_distance: PositiveOrInterval | None = None
-    safety_distances: dict[BodyName, Positive] = Field(default_factory=dict)
-    margin: NonNegativeOrInterval | None = None
-    class_k: UnknownClassKConfig
-    neighbour_velocity: Literal["none", "current", "previous"] = "none"
-    soft: Flag = False
-    shared: Literal["team", "robot"] | None = None
-
-    @model_validator(mode="after")
-    def _one_distance(self) -> AvoidanceConfig:
-        if (self.safety_distance is None) == (self.margin is None):
-            raise wrong(f"expected safety_distance or margin, got {'neither' if self.margin is None else 'both'}")
-        if self.safety_distances and self.margin is not None:
-            raise wrong(
-                "bodies have a distance of their own beside a safety_distance, not a margin", "safety_distances"
-            )
-        require_interval("safety_distance", self.safety_distance)
-        require_interval("margin", self.margin)
-        if self.safety_distances and self.is_unknown:
-            raise wrong("bodies have no distances of their own where safety parameters are unknown", "safety_distances")
-        if self.shared is not None and not self.is_unknown:
-            raise wrong("expected an unknown gain or distance [low, high] to be shared", "shared")
-        return self
-
-    @property
-    def is_unknown(self) -> bool:
-        """Is a value given as [low, high]?"""
-        return any(isinstance(value, tuple) for value in (self.class_k.gain, self.safety_distance, self.margin))
-
-    @property
-    def uses_radius(self) -> bool:
-        """Do the rows need the bodies' radii?"""
-        return self.margin is not None
-
-    def require_radii(self, radius: Sequence[float] | None) -> None:
-        """Check that the log has the radii that the rows need [m].
-
-        Raises:
-            ConfigError: radii are missing, or are zero with a margin of zero.
-        """
-        if self.margin is not None and radius is None:
-            raise ConfigError("barriers: a margin needs the radii, but the log has none (column radius, bag.radius)")
-        if self.margin is not None and radius is not None and as_interval(self.margin)[0] + min(radius) <= 0:
-            raise ConfigError("barriers: a margin of 0 needs positive radii")
-
-    def build(self, bodies: Sequence[str]) -> Barrier:
-        """The barrier among these bodies. Its values are known.
-
-        Raises:
-            ConfigError: `safety_distances` names a body that is not there.
-        """
-        import torch
-
-        from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
-
-        for name in self.safety_distances:
-            require_body(f"safety_distances.{name}", name, bodies)
-        gain, Ds, margin = (known(value) for value in (self.class_k.gain, self.safety_distance, self.margin))
-        assert gain is not None
-        if self.safety_distances:
-            Ds = torch.tensor([self.safety_distances.get(body, Ds) for body in bodies], dtype=torch.float64)
-        class_k = ClassK(gain, self.class_k.power)
-        return CollisionAvoidance(class_k, Ds, margin, self.distance, self.neighbour_velocity, self.soft)
-
-    def build_unknown(self, radius: Sequence[float] | None) -> UnknownAvoidance:
-        """The barrier with intervals for all values, among bodies with these radii [m]."""
-        from torchfsid.robots.unknown_avoidance import UnknownAvoidance
-
-        between = None if self.safety_distance is None else as_interval(self.safety_distance)
-        margin = None if self.margin is None else as_interval(self.margin)
-        return UnknownAvoidance(
-            as_interval(self.class_k.gain),
-            between,
-            margin,
-            self.class_k.power,
-            self.distance,
-            self.neighbour_velocity,
-            self.soft,
-            self.shared or "team",
-            _commonest_sum(radius) if margin is not None and radius is not None else 0.0,
-        )
-
-
-def _commonest_sum(radius: Sequence[float]) -> float:
-    """The sum of radii that most pairs of bodies have [m]."""
-    pairs = Counter(sum(pair) for pair in combinations(radius, 2)) or Counter([2 * radius[0]])
-    return max(pairs, key=lambda total: (pairs[total], total))
 
 
 class _RobotsOwn(Strict):
     """A barrier whose rows do not depend on other bodies."""
 
     is_unknown: ClassVar[bool] = False
+    is_second_order: ClassVar[bool] = False
 
     @property
     def uses_radius(self) -> bool:
@@ -196,6 +49,21 @@ class SpeedBoxConfig(_RobotsOwn):
         from torchfsid.robots.barriers import SpeedBox
 
         return SpeedBox(self.limit, self.soft)
+
+
+class AccelerationBoxConfig(_RobotsOwn):
+    """`SpeedBox` of robots that are driven by accelerations: a limit per axis [m/s2]."""
+
+    kind: Literal["acceleration_box"] = "acceleration_box"
+    limit: Annotated[tuple[Positive, ...], Field(min_length=2, max_length=2)]
+    soft: Flag = False
+    is_second_order: ClassVar[bool] = True
+
+    def build(self, bodies: Sequence[str]) -> Barrier:
+        """The barrier. It does not depend on the bodies."""
+        from torchfsid.robots.barriers import SpeedBox
+
+        return SpeedBox(self.limit, self.soft, "acceleration")
 
 
 class SpeedPolygonConfig(_RobotsOwn):
@@ -276,6 +144,7 @@ class OrcaConfig(Strict):
     margin: NonNegative = 0.0
     push_away: NonNegative = 0.0
     is_unknown: ClassVar[bool] = False
+    is_second_order: ClassVar[bool] = False
 
     @property
     def uses_radius(self) -> bool:
@@ -311,7 +180,26 @@ class OrcaConfig(Strict):
         )
 
 
+SECOND_ORDER = "avoidance, order: 2"
+
+
+def _kind(value: Any) -> str | None:
+    if not isinstance(value, Mapping):  # a record, or no section at all, which any of the classes refuses
+        value = {"kind": getattr(value, "kind", "avoidance"), "order": getattr(value, "order", 2)}
+    kind = value.get("kind")
+    if kind == "avoidance" and value.get("order") == 2:
+        return SECOND_ORDER
+    return kind if kind is None or isinstance(kind, str) else ""
+
+
 BarrierConfig = Annotated[
-    AvoidanceConfig | OrcaConfig | SpeedDiscConfig | SpeedBoxConfig | SpeedPolygonConfig | ArenaConfig,
-    Field(discriminator="kind"),
+    Annotated[AvoidanceConfig, Tag("avoidance")]
+    | Annotated[SecondOrderAvoidanceConfig, Tag(SECOND_ORDER)]
+    | Annotated[OrcaConfig, Tag("orca")]
+    | Annotated[SpeedDiscConfig, Tag("speed_disc")]
+    | Annotated[SpeedBoxConfig, Tag("speed_box")]
+    | Annotated[AccelerationBoxConfig, Tag("acceleration_box")]
+    | Annotated[SpeedPolygonConfig, Tag("speed_polygon")]
+    | Annotated[ArenaConfig, Tag("arena")],
+    Discriminator(_kind),
 ]

@@ -11,7 +11,8 @@ import re
 import reprlib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from types import UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
@@ -45,14 +46,19 @@ class Strict(BaseModel):
     def _sections(cls) -> Iterator[tuple[str, Iterable[str]]]:
         """The keys that are sections of their own, each with its keys."""
         for name, field in cls.model_fields.items():
-            for part in (field.annotation, *get_args(field.annotation)):
+            parts: list[Any] = [field.annotation]
+            for part in parts:
                 if isinstance(part, type) and issubclass(part, Strict):
                     yield name, part.model_fields
+                elif get_origin(part) in (Annotated, Union, UnionType):
+                    parts += get_args(part)
 
 
 Config = TypeVar("Config", bound=Strict)
 
-CHOICES = frozenset({"<section>", "<false>", "<number>", "<interval>"})
+CHOICES = frozenset(
+    {"<section>", "<false>", "<number>", "<interval>", "<velocity>", "<acceleration>", "avoidance, order: 2"}
+)
 """Tags of values of two kinds, a section or False, a number or an interval. Pydantic puts them into paths, but they are
 no keys."""
 

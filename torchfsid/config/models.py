@@ -13,6 +13,7 @@ An avoidance barrier may leave its form open. Each combination is a hypothesis:
     class_k: {gain: 2.0, power: [1, 3]}
     distance: [squared, euclidean]
     neighbour_velocity: auto                          or a list; auto is [none, current, previous]
+    neighbour_acceleration: auto                      likewise, with order: 2; auto is [none, current]
 """
 
 from __future__ import annotations
@@ -126,6 +127,9 @@ def _open_forms(barriers: Any) -> Iterator[tuple[int, str, list[Any]]]:
             yield i, "distance", barrier["distance"]
         if share == "auto" or isinstance(share, list):
             yield i, "neighbour_velocity", ["none", "current", "previous"] if share == "auto" else share
+        pull = barrier.get("neighbour_acceleration")
+        if pull == "auto" or isinstance(pull, list):
+            yield i, "neighbour_acceleration", ["none", "current"] if pull == "auto" else pull
 
 
 def dump_models(models: Mapping[str, ObserveConfig]) -> str:

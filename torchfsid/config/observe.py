@@ -6,15 +6,16 @@ of their own (`tasks`, `barriers`, `observers`), because other files use them to
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
+from torchfsid.config.avoidance import AvoidanceConfig
 from torchfsid.config.bags import BagConfig
-from torchfsid.config.barriers import AvoidanceConfig, BarrierConfig
+from torchfsid.config.barriers import BarrierConfig
 from torchfsid.config.documents import Strict, wrong
-from torchfsid.config.observers import ObservedNoiseConfig, PriorConfig, UkfConfig
+from torchfsid.config.observers import AccelerationNoiseConfig, ObservedNoiseConfig, PriorConfig, UkfConfig
 from torchfsid.config.quantities import BodyName, Positive, require_body
 from torchfsid.config.tasks import TaskConfig
 from torchfsid.errors import ConfigError
@@ -30,6 +31,18 @@ if TYPE_CHECKING:
 
 def _choice(value: Any) -> str:
     return "<false>" if value is False else "<section>"
+
+
+def _driven_by(value: Any) -> str:
+    accelerates = "acceleration" in value if isinstance(value, Mapping) else hasattr(value, "acceleration")
+    return "<acceleration>" if accelerates else "<velocity>"
+
+
+AnyNoiseConfig = Annotated[
+    Annotated[ObservedNoiseConfig, Tag("<velocity>")] | Annotated[AccelerationNoiseConfig, Tag("<acceleration>")],
+    Discriminator(_driven_by),
+]
+"""`noise: {acceleration: ..}` is for robots that are driven by accelerations."""
 
 
 OptionalUkfConfig = Annotated[
@@ -49,7 +62,9 @@ class ObserveConfig(Strict):
         set: which set is intersected over time.
         active_tolerance: distance of the control from a row's boundary below which the row counts as active [m/s] (G.,
             Eqs. (11), (12), (17)).
-        velocity: take velocities from the log (`logged`), or from differences of its positions (`differentiated`).
+        dynamics: robots that are driven by velocities, or by accelerations (`double_integrator`).
+        velocity: take controls from the log (`logged`), or from differences (`differentiated`): velocities from those
+            of positions, accelerations from those of velocities.
         obstacles: bodies of the log that are avoided but not inferred.
         on_inconsistent: what happens to a set when the intersection is empty: `hold` keeps it, `reset` starts again
             from the prior, `raise` ends the command.
@@ -60,9 +75,10 @@ class ObserveConfig(Strict):
     task: TaskConfig
     barriers: Annotated[tuple[BarrierConfig, ...], Field(min_length=1)]
     prior: PriorConfig
-    noise: ObservedNoiseConfig
+    noise: AnyNoiseConfig
     set: Literal["inverse_optimal", "critical_region"] = "inverse_optimal"
     active_tolerance: Positive = 1e-3
+    dynamics: Literal["single_integrator", "double_integrator"] = "single_integrator"
     velocity: Literal["logged", "differentiated"] = "logged"
     obstacles: tuple[BodyName, ...] = ()
     on_inconsistent: Literal["hold", "reset", "raise"] = "hold"
@@ -74,6 +90,7 @@ class ObserveConfig(Strict):
         expected, got = self.task.parameters, len(self.prior.lower)
         if got != expected:
             raise wrong(f"task '{self.task.kind}' has {expected} parameters, lower and upper have {got}", "prior")
+        self._require_one_order()
         unknown = [i for i, barrier in enumerate(self.barriers) if barrier.is_unknown]
         if len(unknown) > 1:
             raise wrong("one barrier may have unknown parameters, and another one has", f"barriers[{unknown[1]}]")
@@ -85,15 +102,39 @@ class ObserveConfig(Strict):
             raise wrong("critical_region needs a known gain, take inverse_optimal", "set")
         if self.task.is_unknown and self.on_inconsistent == "reset":
             raise wrong("a gain can be narrowed only where robots keep their goals", "on_inconsistent")
-        if self.task.is_unknown and self.noise.velocity == "auto":
+        if self.task.is_unknown and self.noise.control == "auto":
             raise wrong("auto takes an error of the gain for noise, give a number or a known gain", "noise")
-        if self.noise.velocity == "auto" and self.on_inconsistent == "reset":
+        if self.noise.control == "auto" and self.on_inconsistent == "reset":
             raise wrong("auto takes a change of goal for noise, give a number or take on_inconsistent: hold", "noise")
         return self
 
-    def with_velocity_bound(self, bound: float) -> ObserveConfig:
-        """The same configuration with `noise.velocity` = `bound` [m/s]."""
-        return self.model_copy(update={"noise": self.noise.model_copy(update={"velocity": bound})})
+    def _require_one_order(self) -> None:
+        """Check that task, barriers and noise are those of robots with these dynamics."""
+        second, dynamics = self.is_second_order, f"dynamics: {self.dynamics}"
+        if second and self.task.kind != "goal":
+            raise wrong(f"expected 'goal' with {dynamics}, got {self.task.kind!r}", "task.kind")
+        if second and getattr(self.task, "law", "proportional") != "proportional":
+            raise wrong(f"expected 'proportional' with {dynamics}", "task.law")
+        if not second and self.task.needs_velocity is not None:
+            raise wrong("needs dynamics: double_integrator", f"task.{self.task.needs_velocity}")
+        for i, barrier in enumerate(self.barriers):
+            if barrier.kind == "avoidance" and barrier.is_second_order != second:
+                raise wrong(f"expected {1 + second} with {dynamics}, got {2 - second}", f"barriers[{i}].order")
+            if barrier.is_second_order != second:
+                limits = "rows over accelerations, such as acceleration_box," if second else "rows over velocities"
+                raise wrong(f"expected {limits} with {dynamics}, got {barrier.kind!r}", f"barriers[{i}].kind")
+        needed = "acceleration" if second else "velocity"
+        if self.noise.quantity != needed:
+            raise wrong(f"expected a bound on {needed} with {dynamics}", f"noise.{needed}")
+
+    @property
+    def is_second_order(self) -> bool:
+        """Are the robots driven by accelerations?"""
+        return self.dynamics == "double_integrator"
+
+    def with_bound(self, bound: float) -> ObserveConfig:
+        """The same configuration with another bound on the error of controls [`noise.unit`]."""
+        return self.model_copy(update={"noise": self.noise.with_control(bound)})
 
     @property
     def is_unknown(self) -> bool:
@@ -144,7 +185,7 @@ class ObserveConfig(Strict):
         """The observer of this number of robots: sets, with the filter beside them unless `ukf` is False.
 
         Raises:
-            ConfigError: `noise.velocity` is `auto`, and the bound has not been determined yet.
+            ConfigError: the bound on controls is `auto`, and has not been determined yet.
         """
         from torchfsid.observers.hybrid import HybridObserver
         from torchfsid.observers.safety import SafetyObserver

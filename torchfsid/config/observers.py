@@ -6,7 +6,7 @@ import math
 import reprlib
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from pydantic import field_validator, model_validator
 
@@ -88,37 +88,109 @@ class NoiseConfig(_Errors):
         )
 
 
-class ObservedNoiseConfig(_Errors):
-    """`NoiseConfig` for a log. With `velocity: auto` the bound is determined from the log itself."""
+Bound = float | Literal["auto"]
 
-    velocity: float | Literal["auto"]
 
-    @field_validator("velocity", mode="plain")
-    @classmethod
-    def _is_bound_or_auto(cls, value: object) -> float | Literal["auto"]:
-        if value == "auto":
-            return "auto"
-        bound = as_number(value)
-        if not isinstance(bound, int | float) or isinstance(bound, bool) or not 0 <= bound <= sys.float_info.max:
-            raise wrong(f"expected a bound of at least 0 m/s or 'auto', got {reprlib.repr(value)}")
-        return float(bound)
+def _bound_or_auto(value: object, unit: str) -> Bound:
+    if value == "auto":
+        return "auto"
+    bound = as_number(value)
+    if not isinstance(bound, int | float) or isinstance(bound, bool) or not 0 <= bound <= sys.float_info.max:
+        raise wrong(f"expected a bound of at least 0 {unit} or 'auto', got {reprlib.repr(value)}")
+    return float(bound)
+
+
+class _ObservedErrors(_Errors):
+    """Bounds on the errors of a log, where that on controls may be `auto`.
+
+    Attributes:
+        quantity: what the controls are; the key of their bound.
+        unit: their unit.
+    """
+
+    quantity: ClassVar[Literal["velocity", "acceleration"]]
+    unit: ClassVar[str]
+
+    @property
+    def control(self) -> Bound:
+        """The bound on the error of controls."""
+        return getattr(self, self.quantity)
+
+    def with_control(self, bound: float) -> _ObservedErrors:
+        """The same bounds with another one on the error of controls."""
+        return self.model_copy(update={self.quantity: bound})
 
     def build(self) -> NoiseBound:
         """The `NoiseBound` with these bounds.
 
         Raises:
-            ConfigError: `velocity` is `auto`. Determine the bound first, and use `ObserveConfig.with_velocity_bound`.
+            ConfigError: the bound on controls is `auto`. Determine it first, and use `ObserveConfig.with_bound`.
         """
-        if self.velocity == "auto":
-            raise ConfigError("noise.velocity: expected a number, got 'auto'")
+        if self.control == "auto":
+            raise ConfigError(f"noise.{self.quantity}: expected a number, got 'auto'")
+        return self._built()
+
+    def build_others(self) -> NoiseBound:
+        """The same with zero in place of the bound on controls."""
+        return self.with_control(0.0)._built()
+
+    def _built(self) -> NoiseBound:
+        raise NotImplementedError
+
+
+class ObservedNoiseConfig(_ObservedErrors):
+    """`NoiseConfig` for a log. With `velocity: auto` the bound is determined from the log itself."""
+
+    velocity: Bound
+    quantity: ClassVar[Literal["velocity", "acceleration"]] = "velocity"
+    unit: ClassVar[str] = "m/s"
+
+    @field_validator("velocity", mode="plain")
+    @classmethod
+    def _is_bound_or_auto(cls, value: object) -> Bound:
+        return _bound_or_auto(value, cls.unit)
+
+    def _built(self) -> NoiseBound:
         return NoiseConfig(**self.model_dump()).build()
+
+
+class AccelerationNoiseConfig(_ObservedErrors):
+    """`NoiseBound` for a log of robots that are driven by accelerations.
+
+    Attributes:
+        acceleration: bound on the error of controls [m/s2], or `auto`.
+        slack: bound on the error of slacks [m/s2].
+        velocity: bound on the error of the measured velocities of all bodies [m/s].
+        neighbour_velocity: a larger one for those of other bodies [m/s].
+        neighbour_acceleration: bound on the error of other bodies' accelerations, where rows use them [m/s2].
+    """
+
+    acceleration: Bound
+    velocity: NonNegative = 0.0
+    neighbour_acceleration: NonNegative = 0.0
+    quantity: ClassVar[Literal["velocity", "acceleration"]] = "acceleration"
+    unit: ClassVar[str] = "m/s2"
+
+    @field_validator("acceleration", mode="plain")
+    @classmethod
+    def _is_bound_or_auto(cls, value: object) -> Bound:
+        return _bound_or_auto(value, cls.unit)
+
+    def _built(self) -> NoiseBound:
+        from torchfsid.robots.bounds import NoiseBound
+
+        assert self.acceleration != "auto"
+        others = max(self.velocity, self.neighbour_velocity)
+        pull = self.neighbour_acceleration
+        return NoiseBound(self.acceleration, self.slack, self.position, others, pull, arrival=self.velocity)
 
 
 class UkfConfig(Strict):
     """The unscented Kalman filter on [x; theta], and how the hybrid observer combines it with the set.
 
     Attributes:
-        position_noise: standard deviation of a measured position [m]. R is its square.
+        position_noise: standard deviation of a measured position [m], and of a measured velocity [m/s] of robots that
+            are driven by accelerations. R is its square.
         process_noise: standard deviation of theta's drift in one second [units of theta].
         prior_std: standard deviation of theta at the start. Default: that of a uniform distribution over the prior.
         qp_inside: solve the QP inside the filter's dynamics. Otherwise the measurement determines the active rows.

@@ -65,6 +65,11 @@ class _Task(Strict):
         return False
 
     @property
+    def needs_velocity(self) -> str | None:
+        """The key that makes the nominal control depend on the robot's velocity, if there is one."""
+        return None
+
+    @property
     def required(self) -> tuple[str, ...]:
         """The bodies without which a measurement says nothing about theta."""
         return ()
@@ -84,6 +89,9 @@ class GoalConfig(_Task):
         dead_zone: distance from the goal within which the nominal control is zero [m].
         speed: the constant speed [m/s].
         tolerance: distance from the goal at which the robot stops [m].
+        damping: of robots that are driven by accelerations [1/s]. Their gain is in [1/s2].
+        velocity_loop: gain of a loop inside, by which they follow the task as a velocity [1/s]. The gain of the task is
+            then in [1/s], limits are in [m/s].
     """
 
     kind: Literal["goal"] = "goal"
@@ -93,12 +101,14 @@ class GoalConfig(_Task):
     dead_zone: NonNegative = 0.0
     speed: Positive | None = None
     tolerance: Positive | None = None
+    damping: Positive | None = None
+    velocity_loop: Positive | None = None
 
     @model_validator(mode="after")
     def _has_what_its_law_needs(self) -> GoalConfig:
         needed, foreign = ("gain",), ("speed", "tolerance")
         if self.law == "constant_speed":
-            needed, foreign = ("speed", "tolerance"), ("gain", "saturation", "dead_zone")
+            needed, foreign = ("speed", "tolerance"), ("gain", "saturation", "dead_zone", "damping", "velocity_loop")
         for name in needed:
             if getattr(self, name) is None:
                 raise wrong(f"required key is missing, for law '{self.law}'", name)
@@ -114,6 +124,10 @@ class GoalConfig(_Task):
         require_interval("gain", self.gain)
         if self.is_unknown and self.dead_zone > 0:
             raise wrong("expected a known gain with a dead_zone", "gain")
+        if self.damping is not None and self.velocity_loop is not None:
+            raise wrong("expected damping or velocity_loop, got both", "velocity_loop")
+        if self.damping is not None and self.dead_zone > 0:
+            raise wrong("expected none with damping, which brakes in the dead zone, too", "dead_zone")
         if min(self._limits) <= max(as_interval(self.gain)) * self.dead_zone:
             at_edge = max(as_interval(self.gain)) * self.dead_zone
             raise wrong(f"at its edge the speed is {at_edge}, not below the limit", "dead_zone")
@@ -122,6 +136,10 @@ class GoalConfig(_Task):
     @property
     def is_unknown(self) -> bool:
         return isinstance(self.gain, tuple)
+
+    @property
+    def needs_velocity(self) -> str | None:
+        return "damping" if self.damping is not None else "velocity_loop" if self.velocity_loop is not None else None
 
     @property
     def is_clipped(self) -> bool:
@@ -134,6 +152,11 @@ class GoalConfig(_Task):
         limit = self.saturation.limit
         return (limit[0], limit[1]) if isinstance(limit, tuple) else (limit, limit)
 
+    @property
+    def gain_unit(self) -> str:
+        """The unit of the gain of robots with damping is that of robots that are driven by accelerations."""
+        return "1/s" if self.damping is None else "1/s2"
+
     def build(self, bodies: Sequence[str]) -> Task:
         """The `GoalTask` with these values."""
         from torchfsid.robots.tasks import GoalTask, Saturation
@@ -144,11 +167,13 @@ class GoalConfig(_Task):
         assert self.gain is not None
         low, high = as_interval(self.gain)
         gain, error = (low + high) / 2, (high - low) / 2
-        if not self.is_clipped:
-            return GoalTask(gain, gain_error=error)
-        shape = "norm" if self.saturation is None else self.saturation.kind
-        saturation = Saturation(shape, self._limits, gain * self.dead_zone)
-        return GoalTask(gain, saturation=saturation, gain_error=error)
+        saturation = None
+        if self.is_clipped:
+            shape = "norm" if self.saturation is None else self.saturation.kind
+            saturation = Saturation(shape, self._limits, gain * self.dead_zone)
+        if self.velocity_loop is not None:
+            return GoalTask.in_velocity_loop(gain, self.velocity_loop, saturation, error)
+        return GoalTask(gain, saturation=saturation, gain_error=error, damping=self.damping or 0.0)
 
 
 class UnknownGainGoalConfig(_Task):

@@ -41,8 +41,8 @@ from torchfsid.kernels import evidence as kernel
 from torchfsid.robots.barriers import Barrier, controller_failed, possible_rows, row_errors
 from torchfsid.robots.bounds import ErrorBounds, NoiseBound, RowErrors
 from torchfsid.robots.measurement import Measurement
-from torchfsid.robots.neighbours import left_out_inactive
-from torchfsid.robots.tasks import Task
+from torchfsid.robots.neighbours import left_out_inactive, within_bounds
+from torchfsid.robots.tasks import Task, feedback_of
 from torchfsid.sets.feasible_set import FeasibleSet
 from torchfsid.tolerances import ACTIVE_TOLERANCE, ROUND_OFF
 
@@ -62,7 +62,7 @@ class ObservationModel:
         kind: `critical_region` (the paper's Omega, for exact data of exact controllers) or `inverse_optimal`.
         noise: bounds on errors, for `inverse_optimal` and for the alarm.
         active_tolerance: the slack below which a row counts as active for `critical_region`, the case label and
-            (G, f) [m/s].
+            (G, f) [units of the control].
 
     Raises:
         InputError: `inverse_optimal` comes without `noise`, `critical_region` with a clipped nominal control, or
@@ -88,7 +88,7 @@ class ObservationModel:
         if self.kind == "critical_region" and any(getattr(barrier, "uncertain", False) for barrier in self.barriers):
             raise InputError("kind", "inverse_optimal, since some rows are not known exactly", self.kind)
         if not self.active_tolerance > 0:
-            raise InputError("active_tolerance", "a positive speed [m/s]", self.active_tolerance)
+            raise InputError("active_tolerance", "a positive number [units of the control]", self.active_tolerance)
 
 
 @dataclass(frozen=True)
@@ -101,8 +101,8 @@ class Evidence:
         informative: whether the sample is used.
         alarmed: whether it is not used because a hard row is violated beyond its bound.
         infeasible: whether it is not used because the controller may have found its rows infeasible and relaxed them.
-        slack: the slack of every row at the measured control [m/s].
-        excess: the violation of every row beyond its bound [m/s]; positive if it is violated.
+        slack: the slack of every row at the measured control, in its units.
+        excess: the violation of every row beyond its bound, in these units; positive if it is violated.
         hard: the rows that no controller may violate.
         solve: solves the KKT conditions. Use `kkt` instead.
         omega_without: the half-spaces of theta for k items if a row of each were inactive: called with (items, rows).
@@ -120,7 +120,7 @@ class Evidence:
 
     @cached_property
     def kkt(self) -> KktSolution:
-        """The control u* = G theta + f at the observed active set. It is solved once, on first use."""
+        """The control u* = G theta + f at the observed active set, without the task's feedback. It is solved once."""
         return self.solve()
 
     def select(self, items: Int[Tensor, "k"]) -> Evidence:
@@ -141,13 +141,13 @@ class _Sample:
         rows: the rows A u <= b.
         hard: the rows that no controller may violate.
         relaxed: the rows of which the controller takes the least violation if they are infeasible.
-        u: the measured control [m/s].
+        u: the measured control, without the task's feedback.
         C: of the nominal control C theta + d.
-        d: of the nominal control C theta + d [m/s].
+        d: of the nominal control C theta + d.
         usable: whether the sample may be informative, before the rows are tested.
-        bound: the largest slack of an active row [m/s], broadcasting with (B, m).
-        ball: a bound on the error of u [m/s], broadcasting with (B,).
-        drift: a bound on the error of C theta + d [m/s], broadcasting with (B,).
+        bound: the largest slack of an active row, broadcasting with (B, m).
+        ball: a bound on the error of u, broadcasting with (B,).
+        drift: a bound on the error of C theta + d, broadcasting with (B,).
         row_errors: bounds on the errors of the rows; None if their directions are exact.
         corners: the vertices of Theta; None if they are not needed.
     """
@@ -265,7 +265,14 @@ def _sample(model: ObservationModel, theta: FeasibleSet, measurement: Measuremen
         error = u.new_tensor(2 * noise.position)
         if measurement.position_error is not None:
             error = error + measurement.position_error
-        usable = usable & left_out_inactive(model.barriers, measurement, largest + noise.neighbour_velocity, error)
+        usable = usable & left_out_inactive(model.barriers, within_bounds(measurement, noise), largest, error)
+    feedback = feedback_of(model.task, measurement)
+    if feedback is not None:  # what is clipped is w = u - feedback, and A u <= b is A w <= b - A feedback
+        known = feedback.isfinite().all(-1)
+        feedback, usable = torch.where(known.unsqueeze(-1), feedback.to(torch.float64), 0.0), usable & known
+        u, rows = u - feedback, Halfspaces(rows.A, rows.b - dot(rows.A, feedback.unsqueeze(-2)))
+        if errors is not None:
+            ball = ball + model.task.feedback_error(errors)  # type: ignore[attr-defined]
 
     turned = of_rows if of_rows is not None and bool((of_rows.angle > 0).any()) else None
     return _Sample(

@@ -1,6 +1,7 @@
 """ROS 2 bags (sqlite3 or MCAP, with or without zstd) as logs. The extra `ros` is needed, ROS itself is not.
 
-A body is measured by a topic (nav_msgs/Odometry or geometry_msgs/PoseStamped) or by a transform on /tf. Times are the
+A body is measured by a topic (nav_msgs/Odometry or geometry_msgs/PoseStamped) or by a transform on /tf. Accelerations
+come from a geometry_msgs/AccelStamped in the frame of the positions. Times are the
 stamps of the headers, not the times of reception. All positions must be in one frame. The twist of an Odometry is in
 its child frame. The orientation of the pose turns it into the frame of the positions, unless both frames are the same.
 """
@@ -19,10 +20,11 @@ from jaxtyping import Int
 from torchfsid.config.bags import BagConfig
 from torchfsid.errors import ConfigError, FsidError, LogError, one_line
 from torchfsid.logs.log import Log
-from torchfsid.logs.resampling import Track, log_of_tracks
+from torchfsid.logs.resampling import Series, Track, log_of_tracks
 from torchfsid.logs.tables import A_NUMBER, is_measurable
 
 ODOMETRY, POSE, TRANSFORMS = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "tf2_msgs/msg/TFMessage"
+ACCELERATION = "geometry_msgs/msg/AccelStamped"
 TF_TOPIC = "/tf"
 
 UNIT = 1e-2
@@ -47,7 +49,18 @@ def read_bag(path: str | Path, bag: BagConfig) -> Log:
     if len(frames) > 1:
         (one, here), (other, there), *_ = frames.items()
         raise LogError(f"{source}: positions in different frames: {one!r} ({here}) and {other!r} ({there})")
-    tracks = [_track(f"{source}: {origin}", body, samples[origin]) for origin, body in bag.origins]
+    accelerations = {}
+    for topic, body in bag.accelerations.items():
+        origin = f"topic {topic!r}"
+        for sample in samples[origin]:
+            if sample.frame not in frames:
+                raise LogError(
+                    f"{source}: {origin}: accelerations in the frame {sample.frame!r}, not {next(iter(frames))!r}"
+                )
+        accelerations[body] = _series(f"{source}: {origin}", samples[origin])
+    tracks = [
+        _track(f"{source}: {origin}", body, samples[origin], accelerations.get(body)) for origin, body in bag.origins
+    ]
     clock = None if bag.rate is None else _clock(tracks[0].stamps, bag.rate)
     radius = None if bag.radius is None else np.array([bag.radius[track.body] for track in tracks])
     return log_of_tracks(source, tracks, clock, radius)
@@ -59,7 +72,7 @@ class _Sample(NamedTuple):
     Attributes:
         stamp: time of the header [ns].
         frame: frame of the header.
-        x: position [m].
+        x: position [m], or acceleration [m/s2].
         u: velocity in the same frame [m/s], or None.
     """
 
@@ -79,6 +92,7 @@ def _read(path: Path, bag: BagConfig) -> dict[str, list[_Sample]]:
     # The three types are the same in every ROS 2, so no type definition in the bag has to be parsed.
     decode = get_typestore(Stores.LATEST).deserialize_cdr
     samples: dict[str, list[_Sample]] = {origin: [] for origin, _ in bag.origins}
+    samples |= {f"topic {topic!r}": [] for topic in bag.accelerations}
     frames: set[str] = set()
     try:
         with Reader(path) as reader:
@@ -97,8 +111,7 @@ def _read(path: Path, bag: BagConfig) -> dict[str, list[_Sample]]:
                             samples[origin].append(_sample(f"{path}: {origin}", transform.header, position, None))
                 else:
                     origin = f"topic {connection.topic!r}"
-                    read = _of_odometry if connection.msgtype == ODOMETRY else _of_pose
-                    samples[origin].append(read(f"{path}: {origin}", message))
+                    samples[origin].append(_READ[connection.msgtype](f"{path}: {origin}", message))
     except FsidError:
         raise
     except OSError as error:
@@ -116,6 +129,7 @@ def _read(path: Path, bag: BagConfig) -> dict[str, list[_Sample]]:
 def _wanted(path: Path, types: dict[str, set[str]], bag: BagConfig) -> set[str]:
     """The topics to read. Each must be in the bag and have an allowed type."""
     expected = dict.fromkeys(bag.topics, (ODOMETRY, POSE)) | ({TF_TOPIC: (TRANSFORMS,)} if bag.frames else {})
+    expected |= dict.fromkeys(bag.accelerations, (ACCELERATION,))
     for topic, allowed in expected.items():
         if topic not in types:
             raise ConfigError(f"bag: {path}: no topic is called {topic!r}; there are {reprlib.repr(sorted(types))}")
@@ -129,6 +143,10 @@ def _of_pose(where: str, message: Any) -> _Sample:
     return _sample(where, message.header, message.pose.position, None)
 
 
+def _of_acceleration(where: str, message: Any) -> _Sample:
+    return _sample(where, message.header, message.accel.linear, None)
+
+
 def _of_odometry(where: str, message: Any) -> _Sample:
     pose, twist = message.pose.pose, message.twist.twist.linear
     velocity = twist.x, twist.y, twist.z
@@ -138,6 +156,9 @@ def _of_odometry(where: str, message: Any) -> _Sample:
             raise LogError(f"{where}: expected a unit quaternion, got {(q.x, q.y, q.z, q.w)}")
         velocity = _rotated((q.w, q.x, q.y, q.z), velocity)
     return _sample(where, message.header, pose.position, velocity[:2])
+
+
+_READ = {ODOMETRY: _of_odometry, POSE: _of_pose, ACCELERATION: _of_acceleration}
 
 
 def _sample(where: str, header: Any, position: Any, velocity: tuple[float, ...] | None) -> _Sample:
@@ -163,7 +184,18 @@ def _cross(a: Sequence[float], b: Sequence[float]) -> tuple[float, float, float]
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-def _track(where: str, body: str, samples: Sequence[_Sample]) -> Track:
+def _track(where: str, body: str, samples: Sequence[_Sample], acceleration: Series | None) -> Track:
+    stamps, x, u = _in_order(where, samples)
+    return Track(body, stamps, x, u, acceleration)
+
+
+def _series(where: str, samples: Sequence[_Sample]) -> Series:
+    stamps, values, _ = _in_order(where, samples)
+    return Series(stamps, values)
+
+
+def _in_order(where: str, samples: Sequence[_Sample]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Stamps, positions and velocities."""
     ordered = sorted(set(samples))  # transforms are often repeated
     if len(ordered) < 2:
         raise LogError(f"{where}: expected at least 2 messages with different stamps, got {len(ordered)}")
@@ -172,7 +204,7 @@ def _track(where: str, body: str, samples: Sequence[_Sample]) -> Track:
         t = stamps[np.argmin(np.diff(stamps))] / 1_000_000_000
         raise LogError(f"{where}: different messages have the same stamp, {t} s")
     u = None if ordered[0].u is None else np.array([sample.u for sample in ordered])
-    return Track(body, stamps, np.array([sample.x for sample in ordered]), u)
+    return stamps, np.array([sample.x for sample in ordered]), u
 
 
 def _clock(stamps: Int[np.ndarray, "samples"], rate: float) -> Int[np.ndarray, "times"]:

@@ -6,8 +6,14 @@ than v, the largest speed of any body in the log. Then at s + l h, with 0 < l < 
     x = (1 - l) x(s) + l x(s + h)       error <= 2 l (1 - l) h v
     u = 0                               error <= v
 
+Robots that are driven by accelerations have velocities that change continuously. With w the largest acceleration of any
+body in the log, in place of v,
+
+    u = (1 - l) u(s) + l u(s + h)       error <= 2 l (1 - l) h w
+    a = 0                               error <= w
+
 Proof: x - x_true = (1 - l) (x(s) - x_true) + l (x(s + h) - x_true), and x_true is at most l h v away from x(s) and (1 -
-l) h v from x(s + h).
+l) h v from x(s + h). The same holds for u.
 
 A row of such a body is an ordinary row with wider bounds. It is left out where it is provably inactive. It counts as
 active in every direction where the body may be anywhere around the robot. The sample says nothing about the missing
@@ -34,28 +40,44 @@ def bridged(log: Log) -> Log:
     before, after = earlier[k, j], later[k, j]
     h = log.t[after] - log.t[before]
     part = (log.t[k] - log.t[before]) / h
-    fastest = _fastest(log)
 
-    x, position_error, velocity_error = log.x.copy(), np.zeros(gap.shape), np.zeros(gap.shape)
-    x[k, j] = (1 - part[:, None]) * log.x[before, j] + part[:, None] * log.x[after, j]
-    position_error[k, j] = 2 * part * (1 - part) * h * fastest
-    velocity_error[k, j] = fastest
-    return replace(
+    def between(values: np.ndarray) -> np.ndarray:
+        filled = values.copy()
+        filled[k, j] = (1 - part[:, None]) * values[before, j] + part[:, None] * values[after, j]
+        return filled
+
+    def in_gaps(error: np.ndarray | float, declared: np.ndarray | None) -> np.ndarray:
+        errors = np.zeros(gap.shape)
+        errors[k, j] = error
+        return errors if declared is None else declared + errors
+
+    fastest, weight = _fastest(log.t, log.x, log.seen, log.u, log.velocity_known), 2 * part * (1 - part) * h
+    filled = replace(
         log,
-        x=x,
+        x=between(log.x),
         seen=log.seen | gap,
         velocity_known=log.velocity_known | gap,
-        position_error=position_error if log.position_error is None else log.position_error + position_error,
-        velocity_error=velocity_error if log.velocity_error is None else log.velocity_error + velocity_error,
+        position_error=in_gaps(weight * fastest, log.position_error),
+        velocity_error=in_gaps(fastest, log.velocity_error),
         bridged=gap,
+    )
+    if log.a is None or log.acceleration_known is None or log.u is None:
+        return filled
+    strongest = _fastest(log.t, log.u, log.velocity_known, log.a, log.acceleration_known)
+    return replace(
+        filled,
+        u=between(log.u),
+        velocity_error=in_gaps(weight * strongest, log.velocity_error),
+        acceleration_known=log.acceleration_known | gap,
+        acceleration_error=in_gaps(strongest, log.acceleration_error),
     )
 
 
-def _fastest(log: Log) -> float:
-    """The largest speed in the log [m/s], logged or needed to get from one sample of a body to its next."""
-    speeds = [0.0] if log.u is None else [float(np.linalg.norm(log.u[log.velocity_known], axis=-1).max(initial=0.0))]
-    for j in range(len(log.bodies)):
-        rows = np.flatnonzero(log.seen[:, j])
-        moved = np.linalg.norm(np.diff(log.x[rows, j], axis=0), axis=-1)
-        speeds.append(float((moved / np.diff(log.t[rows])).max(initial=0.0)))
-    return max(speeds)
+def _fastest(t: np.ndarray, x: np.ndarray, seen: np.ndarray, rate: np.ndarray | None, known: np.ndarray) -> float:
+    """The largest rate of change of x, logged or needed to get from one sample of a body to its next."""
+    rates = [0.0] if rate is None else [float(np.linalg.norm(rate[known], axis=-1).max(initial=0.0))]
+    for j in range(x.shape[1]):
+        rows = np.flatnonzero(seen[:, j])
+        moved = np.linalg.norm(np.diff(x[rows, j], axis=0), axis=-1)
+        rates.append(float((moved / np.diff(t[rows])).max(initial=0.0)))
+    return max(rates)

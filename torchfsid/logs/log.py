@@ -3,11 +3,12 @@ r"""Recorded logs, as measurements.
 A table (CSV, Parquet) has one table row per body and time. The table rows of one time stand together, and times
 increase. Other columns are ignored.
 
-    t, robot, x, y[, z][, vx, vy[, vz]][, radius]          [s], a name, [m], [m/s], [m]
+    t, robot, x, y[, z][, vx, vy[, vz]][, ax, ay[, az]][, radius]          [s], a name, [m], [m/s], [m/s2], [m]
 
 (vx, vy) is the control computed at t from the positions at t. It is held until the next sample t_+ (zero-order hold).
-If it was not logged, it is exactly (x(t_+) - x(t)) / (t_+ - t). A body without a table row at t is not there at t. If
-it has table rows before and after, see `gaps`.
+If it was not logged, it is exactly (x(t_+) - x(t)) / (t_+ - t). Of robots that are driven by accelerations, (vx, vy) is
+the velocity at t, and (ax, ay) the control. If that was not logged, it is exactly (v(t_+) - v(t)) / (t_+ - t). A body
+without a table row at t is not there at t. If it has table rows before and after, see `gaps`.
 
 PyTorch is imported only when the measurements are asked for, so that a wrong log is refused at once.
 """
@@ -45,11 +46,14 @@ class Log:
         t: times [s], increasing.
         x: positions [m].
         u: velocities [m/s], or None if the log has none.
+        a: accelerations [m/s2], the controls of robots of second order, or None if the log has none.
         seen: the body is there at t.
         velocity_known: the body is there at t and its velocity is known.
+        acceleration_known: the body is there at t and its acceleration is known. None if the log has none.
         radius: radii [m], or None if the log has none.
         position_error: bounds on the errors of x [m]. None means zero.
         velocity_error: bounds on the errors of u [m/s]. None means zero.
+        acceleration_error: bounds on the errors of a [m/s2]. None means zero.
         lost: the body is there at t but its position is unknown. None means that a body that is not seen is not there.
         bridged: the body was not measured at t, and its position is interpolated (see `gaps`). It is then not observed
             itself.
@@ -67,6 +71,20 @@ class Log:
     velocity_error: Float[np.ndarray, "times bodies"] | None = None
     lost: Bool[np.ndarray, "times bodies"] | None = None
     bridged: Bool[np.ndarray, "times bodies"] | None = None
+    a: Float[np.ndarray, "times bodies n"] | None = None
+    acceleration_known: Bool[np.ndarray, "times bodies"] | None = None
+    acceleration_error: Float[np.ndarray, "times bodies"] | None = None
+
+    @property
+    def controls(self) -> tuple[Float[np.ndarray, "times bodies n"] | None, Bool[np.ndarray, "times bodies"]]:
+        """The controls, and where they are known: accelerations if there are any, otherwise velocities."""
+        if self.a is None or self.acceleration_known is None:
+            return self.u, self.velocity_known
+        return self.a, self.acceleration_known
+
+    def of_first_order(self) -> Log:
+        """The log without accelerations: its velocities are the controls."""
+        return replace(self, a=None, acceleration_known=None, acceleration_error=None)
 
     @property
     def previous_known(self) -> Bool[np.ndarray, "times bodies"]:
@@ -82,26 +100,60 @@ class Log:
             LogError: a difference quotient is not finite.
         """
         known = self.seen[:-1] & self.seen[1:]
-        with np.errstate(over="ignore", invalid="ignore"):
-            u = np.where(known[..., None], np.diff(self.x, axis=0) / np.diff(self.t)[:, None, None], 0.0)
-        if not np.isfinite(u).all():
-            k = int(np.argmin(np.isfinite(u).all(axis=(1, 2))))
-            raise LogError(f"{self.source}: no finite velocities from t = {self.t[k]} to {self.t[k + 1]}")
+        u = self._quotients(self.x, known, "velocities")
         return replace(self, t=self.t[:-1], x=self.x[:-1], u=u, seen=self.seen[:-1], velocity_known=known)
+
+    def accelerated(self, velocity_error: float) -> Log:
+        """The log with accelerations from differences of its velocities (module docstring), without its last time.
+
+        Velocities that are wrong by e and e_+ make an acceleration wrong by at most (e + e_+) / (t_+ - t).
+
+        Args:
+            velocity_error: a bound on the errors of all velocities [m/s], beside `velocity_error` of the log.
+
+        Raises:
+            LogError: the log has no velocities, or a difference quotient is not finite.
+        """
+        if self.u is None:
+            raise LogError(f"{self.source}: no velocities (vx, vy) from which accelerations could follow")
+        known = self.velocity_known[:-1] & self.velocity_known[1:]
+        error = np.full(self.seen.shape, velocity_error) + (0.0 if self.velocity_error is None else self.velocity_error)
+        return replace(
+            self,
+            t=self.t[:-1],
+            x=self.x[:-1],
+            u=self.u[:-1],
+            seen=self.seen[:-1],
+            velocity_known=self.velocity_known[:-1],
+            velocity_error=None if self.velocity_error is None else self.velocity_error[:-1],
+            a=self._quotients(self.u, known, "accelerations"),
+            acceleration_known=known,
+            acceleration_error=(error[:-1] + error[1:]) / np.diff(self.t)[:, None],
+        )
+
+    def _quotients(self, values: np.ndarray, known: np.ndarray, name: str) -> np.ndarray:
+        """The difference quotients of values in time, zero where unknown."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = np.where(known[..., None], np.diff(values, axis=0) / np.diff(self.t)[:, None, None], 0.0)
+        if not np.isfinite(found).all():
+            k = int(np.argmin(np.isfinite(found).all(axis=(1, 2))))
+            raise LogError(f"{self.source}: no finite {name} from t = {self.t[k]} to {self.t[k + 1]}")
+        return found
 
     def measurements(
         self, robots: Sequence[str], neighbour_velocities: Collection[str], required: Collection[str] = ()
     ) -> Iterator[Measurement]:
         """One measurement per time, of the batch of these robots among all bodies.
 
-        A robot is `observed` where its velocity is known, the `required` bodies are there, and the
-        `neighbour_velocities` are known. A row with an unknown right-hand side cannot be left out: it may be the active
-        one, and the set would lose the truth. For the same reason no robot is observed while a body is `lost`. A
+        If the log has accelerations, they are the controls. A robot is `observed` where its control is known, the
+        `required` bodies are there, and what the rows use of other bodies is known: the `neighbour_velocities`, and all
+        velocities if there are accelerations. A row with an unknown right-hand side cannot be left out: it may be the
+        active one, and the set would lose the truth. For the same reason no robot is observed while a body is `lost`. A
         `bridged` body is not observed, but other robots avoid it.
 
         Args:
             robots: names of the robots of the batch.
-            neighbour_velocities: what the barriers use. `current` needs the velocity of every body that is there.
+            neighbour_velocities: what the barriers use. `current` needs the control of every body that is there.
                 `previous` needs the same one sample earlier, the robot's own included.
             required: bodies without which a measurement says nothing, such as the leader of a formation.
 
@@ -113,9 +165,12 @@ class Log:
         if missing := [name for name in (*robots, *required) if name not in self.bodies]:
             raise LogError(f"{self.source}: no body is called {missing[0]!r}; there are {reprlib.repr(self.bodies)}")
         index, leaders = ([self.bodies.index(name) for name in names] for names in (robots, required))
-        observed = self.velocity_known[:, index] & self.seen[:, leaders].all(axis=1, keepdims=True)
+        _, control_known = self.controls
+        observed = control_known[:, index] & self.seen[:, leaders].all(axis=1, keepdims=True)
+        if self.a is not None:
+            observed &= self.velocity_known[:, index] & (self.velocity_known | ~self.seen).all(axis=1, keepdims=True)
         if "current" in neighbour_velocities:
-            observed &= (self.velocity_known | ~self.seen).all(axis=1, keepdims=True)
+            observed &= (control_known | ~self.seen).all(axis=1, keepdims=True)
         if "previous" in neighbour_velocities:
             observed &= (self.previous_known | ~self.seen).all(axis=1, keepdims=True)
         if self.lost is not None:
@@ -136,10 +191,12 @@ class Log:
 
         x, u, seen, observes = (torch.from_numpy(array) for array in (self.x, velocities, self.seen, observed))
         previous_u = torch.from_numpy(_one_earlier(velocities))
-        radius, x_error, u_error, bodies_u_error = (
+        radius, x_error, u_error, bodies_u_error, a, a_error = (
             None if array is None else torch.from_numpy(array)
-            for array in (self.radius, self.position_error, self.velocity_error, neighbour_error)
-        )
+            for array in (
+                self.radius, self.position_error, self.velocity_error, neighbour_error, self.a, self.acceleration_error
+            )
+        )  # fmt: skip
         for k, t in enumerate(self.t.tolist()):
             team = Measurement.of_team(
                 t,
@@ -147,12 +204,14 @@ class Log:
                 u[k],
                 robots=robots,
                 previous_u=previous_u[k],
+                acceleration=None if a is None else a[k],
+                acceleration_error=None if a_error is None else a_error[k],
                 radius=radius,
                 seen=seen[k],
                 position_error=None if x_error is None else x_error[k],
                 velocity_error=None if u_error is None else u_error[k],
             )
-            if bodies_u_error is not None:
+            if bodies_u_error is not None and a is None:
                 errors = bodies_u_error[k]
                 team = replace(team, body_velocity_error=errors.expand_as(team.present), arrival_error=errors[robots])
             yield replace(team, observed=observes[k])
@@ -184,7 +243,9 @@ def read_parquet(path: str | Path) -> Log:
 def _log_in(table: Table) -> Log:
     axes = [axis for axis in "xyz" if axis in "xy" or axis in table.header]
     velocities = [f"v{axis}" for axis in "xyz" if f"v{axis}" in table.header]
-    for name in ["t", "robot", *axes, *(f"v{axis}" for axis in axes if velocities)]:
+    accelerations = [f"a{axis}" for axis in axes]
+    accelerations = accelerations if set(accelerations) <= set(table.header) else []
+    for name in ["t", "robot", *axes, *(f"v{axis}" for axis in axes if velocities), *accelerations]:
         require_column(table, name)
     if "z" not in axes and "vz" in velocities:
         raise table.header_error("column 'vz' without 'z'")
@@ -227,6 +288,8 @@ def _log_in(table: Table) -> Log:
         u=by_time_and_body(velocities) if velocities else None,
         seen=seen,
         velocity_known=seen if velocities else np.zeros_like(seen),
+        a=by_time_and_body(accelerations) if accelerations else None,
+        acceleration_known=seen if accelerations else None,
         radius=_radius(table, names, body) if "radius" in table.header else None,
     )
 

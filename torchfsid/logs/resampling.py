@@ -10,6 +10,9 @@ interval and the two beside it: from one sample to the next, and from a sample t
 The bound on u also assumes that u changes no faster than V / h. As in every log, (vx, vy) at t is the command for the
 positions at t, and these change continuously even where a command is held. Both errors are zero at samples.
 
+Accelerations have samples of their own. They are interpolated like u, with V the largest change from one of their
+samples to the next.
+
 Proof: with m, m' the mean velocities before and after, x(t) = x_k + l h m and x_{k+1} - x_k = h (l m + (1 - l) m'), so
 the error of x is l (1 - l) h (m - m'), and |m - m'| <= V. And |u(t) - u_k| <= l V, |u(t) - u_{k+1}| <= (1 - l) V.
 
@@ -38,6 +41,14 @@ MIN_RUN = 3
 
 
 @dataclass(frozen=True)
+class Series:
+    """Accelerations [m/s2] at their own stamps [ns], increasing."""
+
+    stamps: Int[np.ndarray, "samples"]
+    values: Float[np.ndarray, "samples 2"]
+
+
+@dataclass(frozen=True)
 class Track:
     """The samples of one body.
 
@@ -46,12 +57,14 @@ class Track:
         stamps: times [ns], increasing.
         x: positions [m].
         u: velocities [m/s], or None if not measured.
+        acceleration: accelerations, or None if not measured.
     """
 
     body: str
     stamps: Int[np.ndarray, "samples"]
     x: Float[np.ndarray, "samples 2"]
     u: Float[np.ndarray, "samples 2"] | None
+    acceleration: Series | None = None
 
 
 @dataclass(frozen=True)
@@ -71,6 +84,13 @@ class ResampledLog(Log):
         assert self.clock is not None
         positions = [replace(track, u=None) for track in self.tracks]
         return _resampled(self.source, positions, self.clock, self.radius, differentiate=True)
+
+    def accelerated(self, velocity_error: float) -> Log:
+        """Not possible: between the times of the clock the accelerations are not held."""
+        raise LogError(
+            f"{self.source}: no accelerations from differences where bodies were measured at different times: "
+            "record them (bag.accelerations)"
+        )
 
 
 def log_of_tracks(
@@ -93,11 +113,14 @@ def log_of_tracks(
         LogError: at no time of the clock are all bodies known.
     """
     first = tracks[0]
-    if not all(np.array_equal(track.stamps, first.stamps) for track in tracks):
+    stamps = [track.stamps for track in tracks] + [of.acceleration.stamps for of in tracks if of.acceleration]
+    if not all(np.array_equal(others, first.stamps) for others in stamps):
         return _resampled(source, tracks, first.stamps if clock is None else clock, radius, differentiate=False)
     seen = np.ones((len(first.stamps), len(tracks)), dtype=bool)
     with_velocity = [track.u is not None for track in tracks]
     u = np.stack([np.zeros_like(track.x) if track.u is None else track.u for track in tracks], axis=1)
+    accelerated = [track.acceleration is not None for track in tracks]
+    a = [np.zeros_like(track.x) if track.acceleration is None else track.acceleration.values for track in tracks]
     return Log(
         source=source,
         bodies=tuple(track.body for track in tracks),
@@ -107,6 +130,8 @@ def log_of_tracks(
         seen=seen,
         velocity_known=seen & np.array(with_velocity),
         radius=radius,
+        a=np.stack(a, axis=1) if any(accelerated) else None,
+        acceleration_known=seen & np.array(accelerated) if any(accelerated) else None,
     )
 
 
@@ -124,6 +149,9 @@ class _Samples(NamedTuple):
     velocity_known: Bool[np.ndarray, "times"]
     position_error: Float[np.ndarray, "times"]
     velocity_error: Float[np.ndarray, "times"]
+    a: Float[np.ndarray, "times 2"]
+    acceleration_known: Bool[np.ndarray, "times"]
+    acceleration_error: Float[np.ndarray, "times"]
 
 
 def _resampled(
@@ -137,6 +165,7 @@ def _resampled(
     bodies = _Samples(*(np.stack(of_bodies, axis=1) for of_bodies in zip(*of_each, strict=True)))
     if not bodies.seen.all(axis=1).any():
         raise LogError(f"{source}: at no time of the clock are all bodies known: {_spans(tracks)}")
+    accelerated = any(track.acceleration is not None for track in tracks)
     return ResampledLog(
         source=source,
         bodies=tuple(track.body for track in tracks),
@@ -148,6 +177,9 @@ def _resampled(
         radius=radius,
         position_error=bodies.position_error,
         velocity_error=bodies.velocity_error,
+        a=bodies.a if accelerated else None,
+        acceleration_known=bodies.acceleration_known if accelerated else None,
+        acceleration_error=bodies.acceleration_error if accelerated else None,
         lost=~bodies.seen,
         tracks=tuple(tracks),
         clock=clock,
@@ -190,7 +222,27 @@ def _sample(track: Track, clock: Int[np.ndarray, "times"], differentiate: bool) 
         velocity_known=known,
         position_error=np.where(joined, weight * periods[interval] * 1e-9 * bound, 0.0),
         velocity_error=np.where(known, u_error, 0.0),
+        **_accelerations(track.acceleration, clock),
     )
+
+
+def _accelerations(series: Series | None, clock: Int[np.ndarray, "times"]) -> dict[str, np.ndarray]:
+    """The accelerations on the clock. Zero where they are unknown."""
+    if series is None:
+        nothing = np.zeros(len(clock))
+        return {"a": np.zeros((len(clock), 2)), "acceleration_known": nothing > 0, "acceleration_error": nothing}
+    stamps, periods = series.stamps, np.diff(series.stamps)
+    interval = np.clip(np.searchsorted(stamps, clock, side="right") - 1, 0, len(periods) - 1)
+    after = (clock - stamps[interval]) / periods[interval]
+    change = _around(periods, np.linalg.norm(np.diff(series.values, axis=0), axis=-1))[interval]
+    known = (np.isfinite(change) & (after > 0) & (after < 1)) | (after == 0) | (after == 1)
+    mean = (1 - after)[:, None] * series.values[interval] + after[:, None] * series.values[interval + 1]
+    error = 2 * np.clip(after * (1 - after), 0.0, None) * np.where(np.isfinite(change), change, 0.0)
+    return {
+        "a": np.where(known[:, None], mean, 0.0),
+        "acceleration_known": known,
+        "acceleration_error": np.where(known, error, 0.0),
+    }
 
 
 def _mean_velocities(track: Track) -> Float[np.ndarray, "intervals 2"]:
@@ -202,17 +254,27 @@ def _change_of_velocity(track: Track) -> Float[np.ndarray, "intervals"]:
     """V of each interval between samples [m/s]. It is NaN in gaps, and where there are too few consecutive samples."""
     periods, means = np.diff(track.stamps), _mean_velocities(track)
     change = np.full(len(periods), np.nan)
-    joined = np.flatnonzero(periods <= MAX_GAP * np.median(periods))
-    runs = [run for run in np.split(joined, np.flatnonzero(np.diff(joined) > 1) + 1) if len(run) >= MIN_RUN]
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is no bound
         if track.u is None:
             to_next = np.linalg.norm(np.diff(means, axis=0), axis=1)
-            for run in runs:
+            for run in _runs(periods):
                 change[run[1:-1]] = to_next[run[:-2]] + to_next[run[1:-1]]
         else:
             seen = [track.u[1:] - track.u[:-1], means - track.u[:-1], means - track.u[1:]]
-            inside = np.linalg.norm(seen, axis=-1).max(axis=0)
-            for run in runs:
-                of_three = np.lib.stride_tricks.sliding_window_view(inside[run], MIN_RUN).max(axis=-1)
-                change[run] = of_three[np.clip(np.arange(len(run)) - 1, 0, len(run) - MIN_RUN)]
+            change = _around(periods, np.linalg.norm(seen, axis=-1).max(axis=0))
     return change
+
+
+def _around(periods: Int[np.ndarray, "intervals"], inside: Float[np.ndarray, "intervals"]) -> np.ndarray:
+    """The largest value of each interval and the two beside it. NaN in gaps, and without enough intervals."""
+    largest = np.full(len(periods), np.nan)
+    for run in _runs(periods):
+        of_three = np.lib.stride_tricks.sliding_window_view(inside[run], MIN_RUN).max(axis=-1)
+        largest[run] = of_three[np.clip(np.arange(len(run)) - 1, 0, len(run) - MIN_RUN)]
+    return largest
+
+
+def _runs(periods: Int[np.ndarray, "intervals"]) -> list[Int[np.ndarray, "run"]]:
+    """The runs of intervals without a gap that are long enough."""
+    joined = np.flatnonzero(periods <= MAX_GAP * np.median(periods))
+    return [run for run in np.split(joined, np.flatnonzero(np.diff(joined) > 1) + 1) if len(run) >= MIN_RUN]

@@ -1,6 +1,6 @@
 r"""The smallest bounds on errors with which a log fits its declared model, whatever the truth is.
 
-    delta_i = min { delta : the sets of robot i's samples with velocity bound delta share a point of the prior }
+    delta_i = min { delta : the sets of robot i's samples with bound delta on controls share a point of the prior }
 
 A set grows with its bound, so bisection finds delta_i. Below it no parameter explains robot i. A hard row that is
 violated by more than its bound is a contradiction too, if `slack` follows `velocity`. The residual of one sample is the
@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -36,7 +36,7 @@ RESOLUTION = 1.02
 """A bound that is found is at most this factor too large."""
 
 SMALLEST = 1e-9
-"""Bounds below this are not told apart [m/s]."""
+"""Bounds below this are not told apart [units of the control]."""
 
 BLOCK = 64
 """Samples read at once."""
@@ -84,9 +84,8 @@ class Consistency:
         task: the task of all robots.
         barriers: the barriers of all robots.
         prior: the robots' prior sets, batch (B,).
-        slack: a separate bound for the slack [m/s]; None for that of the velocity.
-        position: see `NoiseBound` [m].
-        neighbour_velocity: see `NoiseBound` [m/s].
+        slack: a separate bound for the slack [units of the control]; None for that of the control.
+        others: all other bounds. Its `velocity` and `slack` are not used.
     """
 
     def __init__(
@@ -96,11 +95,10 @@ class Consistency:
         barriers: Sequence[Barrier | UnknownAvoidance],
         prior: FeasibleSet,
         slack: float | None = None,
-        position: float = 0.0,
-        neighbour_velocity: float = 0.0,
+        others: NoiseBound | None = None,
     ):
         self.task, self.barriers, self.prior, self.slack = task, barriers, prior, slack
-        self.position, self.neighbour_velocity = position, neighbour_velocity
+        self.others = NoiseBound(0.0) if others is None else others
         self.robots = prior.batch_shape[0]
         unknown = [barrier for barrier in barriers if isinstance(barrier, UnknownAvoidance)]
         self.psi = unknown[0].prior(self.robots) if unknown else None
@@ -108,7 +106,7 @@ class Consistency:
         self.fastest = max(float(sample.u.norm(dim=-1).max()) for sample in measurements if sample.u is not None)
 
     def smallest_bounds(self, largest: float) -> Float[Tensor, "B"]:
-        """delta_i of every robot [m/s], too large by at most `RESOLUTION`. Infinite if it is above `largest`."""
+        """delta_i of every robot, too large by at most `RESOLUTION`. Infinite if it is above `largest`."""
         high = torch.full((self.robots,), largest, dtype=torch.float64)
         possible = self.sets(high).fits
         low = torch.full_like(high, min(SMALLEST, largest))
@@ -120,7 +118,7 @@ class Consistency:
         return torch.where(possible, high, math.inf)
 
     def sets(self, velocity: Float[Tensor, "B"], wanted: Bool[Tensor, "B"] | None = None) -> Fit:
-        """The sets of every robot for its own velocity bound [m/s].
+        """The sets of every robot for its own bound on controls.
 
         The computation stops as soon as all `wanted` robots (default: all) are contradicted.
         """
@@ -151,7 +149,7 @@ class Consistency:
                 return Fit(theta, psi, fits)
 
     def residuals(self, sets: Fit, largest: float) -> Float[Tensor, "samples B"]:
-        """The smallest bound with which each sample's own set meets Theta [m/s].
+        """The smallest bound with which each sample's own set meets Theta.
 
         It is NaN where the sample says nothing of theta, and infinite above `largest`.
         """
@@ -170,7 +168,7 @@ class Consistency:
         return torch.cat(found)
 
     def read(self, block: Block, sets: Fit, velocity: Float[Tensor, "items"]) -> Evidence:
-        """The evidence of a block of samples, given sets and a velocity bound [m/s] for each item."""
+        """The evidence of a block of samples, given sets and a bound on controls for each item."""
         noise = self._noise(velocity)
         if sets.psi is None:
             model = ObservationModel(self.task, self._known, noise=noise)
@@ -184,8 +182,8 @@ class Consistency:
         return [barrier for barrier in self.barriers if not isinstance(barrier, UnknownAvoidance)]
 
     def _noise(self, velocity: Float[Tensor, "items"]) -> NoiseBound:
-        slack = None if self.slack is None else torch.full_like(velocity, self.slack)
-        return NoiseBound(velocity, slack, self.position, self.neighbour_velocity)
+        slack = velocity if self.slack is None else torch.full_like(velocity, self.slack)
+        return replace(self.others, velocity=velocity, slack=slack)
 
     def _meets(
         self, block: Block, sets: Fit, velocity: Float[Tensor, "items"]

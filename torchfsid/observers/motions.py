@@ -1,7 +1,7 @@
-"""The velocity of a robot as a function of theta, from one measurement on. The filter predicts with it.
+"""The control of a robot as a function of theta, from one measurement on. The filter predicts with it.
 
 Motions are records, not closures, so that an observer can be pickled. They take an array of S parameters (S, p) and
-return an array of S velocities (S, n).
+return an array of S controls (S, n).
 """
 
 from __future__ import annotations
@@ -20,20 +20,21 @@ from torchfsid.robots.tasks import Saturation
 
 Array = np.ndarray
 Motion = Callable[[Array], Array]
-"""Velocities (S, n) [m/s] as a function of parameters (S, p)."""
+"""Controls (S, n) as a function of parameters (S, p)."""
 
 
 @dataclass(frozen=True)
 class Wish:
-    """The nominal control uhat = C theta + d, clipped if the task has a saturation."""
+    """The nominal control uhat = clip(C theta + d) + feedback (`Task`)."""
 
     C: Float[Tensor, "n p"]
     d: Float[Tensor, "n"]
+    feedback: Float[Tensor, "n"]
     clip: Saturation | None
 
     def __call__(self, theta: Array) -> Float[Tensor, "s n"]:
         wish = torch.from_numpy(theta) @ self.C.T + self.d
-        return wish if self.clip is None else self.clip(wish)
+        return (wish if self.clip is None else self.clip(wish)) + self.feedback
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,9 @@ r"""A point estimator to compare the sets with: an unscented Kalman filter on [x
 
     x(t + dt) = x(t) + dt (G theta + f) + w_x,   theta(t + dt) = theta(t) + w_theta,   z = x + v
 
+Of robots of second order, whose controls are accelerations, x is the measured velocity: it is what the control changes.
+Their positions follow from it and say nothing more of theta.
+
 Between two measurements the robot moves with the (G, f) of the active set observed at the earlier one. So the model is
 linear, and the filter is a Kalman filter. While two independent rows are active, G = 0 and the filter learns nothing.
 With `qp_inside` the velocity is instead the solution of the safety QP at each sigma point. The active rows then depend
@@ -38,7 +41,7 @@ from torchfsid.observers.motions import Array, Motion, ObservedMotion, QpMotion,
 from torchfsid.outcome import FilterStatus
 from torchfsid.robots.barriers import Barrier, controller_failed, stack_barriers
 from torchfsid.robots.measurement import Measurement
-from torchfsid.robots.tasks import Task
+from torchfsid.robots.tasks import Task, feedback_of
 from torchfsid.tolerances import ACTIVE_TOLERANCE
 
 FLOOR = 1e-8
@@ -83,7 +86,8 @@ class ParameterUkf:
         barriers: the barriers of all robots.
         mean: theta's prior mean.
         spread: standard deviation of theta's prior: one number, one per parameter, or one per robot and parameter.
-        position_noise: standard deviation of a measured position [m]; R is its square.
+        position_noise: standard deviation of a measured position [m], of robots of second order of a measured velocity
+            [m/s]; R is its square.
         process_noise: standard deviation of theta's drift [units of theta per sqrt(s)].
         motion_noise: standard deviation of the error of the model's motion [m/sqrt(s)]. At a step of 0.02 s the default
             allows for an error of the velocity of 7e-3 m/s, which is usual for inexact solvers.
@@ -159,12 +163,15 @@ class ParameterUkf:
             raise InputError("measurement.t", f"a time after {self._t}", t)
         with torch.no_grad():
             motions = self._read_motions(measurement)
-        seen = (measurement.x.abs() < FARTHEST).all(-1)
+        state = measurement.velocity if measurement.is_second_order else measurement.x
+        if state is None:
+            raise InputError("measurement.velocity", "the velocities of the robots, of second order", None)
+        seen = (state.abs() < FARTHEST).all(-1)
         if measurement.observed is not None:
             seen = seen & measurement.observed
         dt = t - self._t if math.isfinite(self._t) else 0.0
 
-        x = measurement.x.detach().to(torch.float64).numpy()
+        x = state.detach().to(torch.float64).numpy()
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             status = [self._update_robot(i, dt, x[i] if seen[i] else None) for i in range(robots)]
         self._t, self._motions = t, motions
@@ -214,16 +221,18 @@ class ParameterUkf:
         u = torch.where(known[:, None], measurement.u, 0.0).to(torch.float64)
         slack = safe_controls.slack(u)
         failed = controller_failed(self.barriers, measurement, safe_controls)
-        known = (known & ~failed & (slack >= -self.active_tolerance).all(-1)).tolist()
-        clip = self.task.saturation
+        known = known & ~failed & (slack >= -self.active_tolerance).all(-1)
+        feedback = feedback_of(self.task, measurement)
+        feedback = torch.zeros_like(u) if feedback is None else torch.where(known[:, None], feedback, 0.0)
+        wishes = [Wish(*of_robot, self.task.saturation) for of_robot in zip(C, d, feedback, strict=True)]
         if self.qp_inside:
-            items = zip(safe_controls.A, safe_controls.b, C, d, strict=True)
-            moving = [QpMotion(Wish(C_i, d_i, clip), Halfspaces(A, b)) for A, b, C_i, d_i in items]
+            items = zip(wishes, safe_controls.A, safe_controls.b, strict=True)
+            moving = [QpMotion(wish, Halfspaces(A, b)) for wish, A, b in items]
         else:
             kkt = solve_kkt(safe_controls, active_set(safe_controls, u, self.active_tolerance), C, d)
-            items = zip(kkt.free, kkt.offset, C, d, strict=True)
-            moving = [ObservedMotion(Wish(C_i, d_i, clip), free, offset) for free, offset, C_i, d_i in items]
-        return [motion if readable else None for motion, readable in zip(moving, known, strict=True)]
+            items = zip(wishes, kkt.free, kkt.offset, strict=True)
+            moving = [ObservedMotion(*of_robot) for of_robot in items]
+        return [motion if readable else None for motion, readable in zip(moving, known.tolist(), strict=True)]
 
     def _update_robot(self, i: int, dt: float, position: Array | None) -> FilterStatus:
         """Bring robot i's filter, mean and covariance to the time of the measurement."""

@@ -98,20 +98,17 @@ class CollisionAvoidance:
     soft: bool = False
 
     def __post_init__(self) -> None:
-        if (self.safety_distance is None) == (self.margin is None):
-            raise InputError("safety_distance, margin", "exactly one of them", (self.safety_distance, self.margin))
-        if self.safety_distance is not None and not bool((torch.as_tensor(self.safety_distance) > 0).all()):
-            raise InputError("safety_distance", "a positive distance [m]", self.safety_distance)
+        require_distance(self.safety_distance, self.margin)
 
     def __call__(self, measurement: Measurement) -> Halfspaces:
         seen = self.geometry(measurement)
-        Ds = self._safety_distance(measurement.radius, measurement.body_radii)
+        Ds = distance_kept(self.safety_distance, self.margin, measurement.radius, measurement.body_radii)
         h = seen.squared - Ds**2 if self.distance == "squared" else seen.r - Ds
         return Halfspaces(-seen.gradient, self.class_k(h) - seen.share).where(measurement.present)
 
     def geometry(self, measurement: Measurement) -> Geometry:
         """Distances, gradients of h and the neighbours' shares, which depend on neither gain nor safety distance."""
-        away = _away(measurement)
+        away = away_from_bodies(measurement)
         squared = dot(away, away)
         apart = squared > 0
         root = torch.where(apart, squared, 1.0).sqrt()
@@ -135,7 +132,7 @@ class CollisionAvoidance:
         self.require_monotone("positions have errors")
         sight, present = self.sight(measurement, bounds, self.geometry(measurement)), measurement.present
         r = torch.where(sight.clear, sight.r, 1.0)
-        Ds = self._safety_distance(measurement.radius, measurement.body_radii)
+        Ds = distance_kept(self.safety_distance, self.margin, measurement.radius, measurement.body_radii)
         e = torch.where(sight.clear, sight.e, 0.0)
         nearer, here, further = (self._boundary(at, Ds) for at in ((r - e).clamp(min=1e-9), r, r + e))
         moved = torch.maximum(here - nearer, further - here)
@@ -172,7 +169,7 @@ class CollisionAvoidance:
         left_out, u = measurement.left_out, measurement.u
         assert left_out is not None
         assert u is not None
-        Ds = self._safety_distance(measurement.radius, left_out.radius.unsqueeze(-1))
+        Ds = distance_kept(self.safety_distance, self.margin, measurement.radius, left_out.radius.unsqueeze(-1))
         largest = Ds.amax(-1) if isinstance(Ds, Tensor) and Ds.ndim > 0 else Ds
         nearest = torch.where(left_out.distance.isfinite(), left_out.distance, 1.0)
         phi = self._boundary((nearest * (1 - ROUND_OFF)).clamp(min=1e-9), largest)
@@ -195,14 +192,6 @@ class CollisionAvoidance:
             return self.class_k(r**2 - Ds**2) / (2 * r)
         return self.class_k(r - Ds)
 
-    def _safety_distance(self, radius: Tensor | None, body_radii: Tensor | None) -> Tensor | float:
-        if self.margin is None:
-            assert self.safety_distance is not None
-            return self.safety_distance
-        if radius is None or body_radii is None:
-            raise InputError("measurement.radius", "radii, since the barrier is given by a margin", None)
-        return radius.unsqueeze(-1) + body_radii + self.margin
-
     def _neighbours(self, measurement: Measurement) -> Tensor:
         current = self.neighbour_velocity == "current"
         velocities = measurement.body_velocities if current else measurement.previous_body_velocities
@@ -211,7 +200,38 @@ class CollisionAvoidance:
         return velocities
 
 
-def _away(measurement: Measurement) -> Float[Tensor, "*batch m n"]:
+def require_distance(distance: float | Tensor | None, margin: float | None) -> None:
+    """Check that a barrier has exactly one of safety distance and margin.
+
+    Raises:
+        InputError: it has both or neither, or the safety distance is not positive.
+    """
+    if (distance is None) == (margin is None):
+        raise InputError("safety_distance, margin", "exactly one of them", (distance, margin))
+    if distance is not None and not bool((torch.as_tensor(distance) > 0).all()):
+        raise InputError("safety_distance", "a positive distance [m]", distance)
+
+
+def distance_kept(
+    distance: float | Tensor | None,
+    margin: float | None,
+    radius: Float[Tensor, "*batch"] | None,
+    body_radii: Float[Tensor, "*batch m"] | None,
+) -> float | Tensor:
+    """The distances Ds that the centres of robots and bodies keep [m]: `distance`, or with a margin between discs.
+
+    Raises:
+        InputError: there is a margin, and there are no radii.
+    """
+    if margin is None:
+        assert distance is not None
+        return distance
+    if radius is None or body_radii is None:
+        raise InputError("measurement.radius", "radii, since the barrier is given by a margin", None)
+    return radius.unsqueeze(-1) + body_radii + margin
+
+
+def away_from_bodies(measurement: Measurement) -> Float[Tensor, "*batch m n"]:
     """x - x_j [m]. Slots without a body get a nonzero vector, so that norms and their gradients are finite."""
     present, away = measurement.present, measurement.x.unsqueeze(-2) - measurement.bodies
     return away if bool(present.all()) else torch.where(present.unsqueeze(-1), away, 1.0)

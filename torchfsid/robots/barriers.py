@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import ClassVar, Literal, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -28,14 +28,18 @@ class Barrier(Protocol):
 
     Two more members are optional. Where one is missing and matters for a sample, the sample is skipped.
 
-        neighbour_velocity          The velocities of other bodies that the rows use: `none`, `current` (one QP decides
-                                    for the whole team) or `previous`. If missing, it may be `current`.
+        neighbour_velocity          The controls of other bodies that the rows use, velocities or, for robots of second
+                                    order, accelerations: `none`, `current` (one QP decides for the whole team) or
+                                    `previous`. If missing, it may be `current`.
         slack_left_out(measurement) (*batch): the least slack that the row of a body without a slot can have at the
-                                    measured control [m/s], given `measurement.left_out`. It is infinite if bodies have
-                                    no rows, and NaN or -inf if nothing is known. If missing, nothing is known.
+                                    measured control, in its units, given `measurement.left_out`. It is infinite if
+                                    bodies have no rows, and NaN or -inf if nothing is known. If missing, nothing is
+                                    known.
 
-    Four more are for barriers that need them:
+    Five more are for barriers that need them:
 
+        order                       2 if the controls are accelerations. Default: 1, velocities. It matters where
+                                    `neighbour_velocity` is `current`.
         rows_within(measurement, bounds)  The rows that may exist, given bounds on the errors of the measurement, where
                                     errors may decide which rows there are. Default: `barrier(measurement)`.
         uncertain                   whether `errors` matter even if positions and other bodies' velocities are exact.
@@ -74,8 +78,14 @@ def possible_rows(barrier: Barrier, measurement: Measurement, bounds: ErrorBound
     return barrier.rows_within(measurement, bounds)  # type: ignore[attr-defined]
 
 
+def neighbours_controls(barriers: Sequence[Barrier]) -> Literal["body_velocities", "body_accelerations"]:
+    """The field of `Measurement` that holds the controls of other bodies."""
+    second_order = any(getattr(barrier, "order", 1) == 2 for barrier in barriers)
+    return "body_accelerations" if second_order else "body_velocities"
+
+
 def is_joint(barriers: Sequence[Barrier]) -> bool:
-    """Does one QP decide for the whole team? It does if some rows use the neighbours' current velocities."""
+    """Does one QP decide for the whole team? It does if some rows use the neighbours' current controls."""
     return any(getattr(barrier, "neighbour_velocity", None) == "current" for barrier in barriers)
 
 
@@ -98,7 +108,7 @@ def controller_failed(
 
     A robot's own QP has failed if its control is zero and zero violates one of its `rows`. It may have failed if zero
     violates a row that is wrong by at most its `errors`. A joint QP that fails stops the whole team. So it may have
-    failed whenever no body moves.
+    failed whenever all controls are zero.
     """
     assert measurement.u is not None
     stopped = (measurement.u == 0).all(-1)
@@ -107,8 +117,9 @@ def controller_failed(
     least = torch.zeros_like(rows.b) if errors is None else errors.slack * rows.norms()
     failed = stopped & (rows.b < least).any(-1)
     perhaps_joint = any(getattr(barrier, "neighbour_velocity", None) in ("current", None) for barrier in barriers)
-    if perhaps_joint and measurement.body_velocities is not None:
-        others_move = (measurement.present & (measurement.body_velocities != 0).any(-1)).any(-1)
+    controls = measurement.body_velocities if measurement.body_accelerations is None else measurement.body_accelerations
+    if perhaps_joint and controls is not None:
+        others_move = (measurement.present & (controls != 0).any(-1)).any(-1)
         failed = failed | (stopped & ~others_move)
     return failed
 
@@ -124,14 +135,15 @@ class _OfNoBody:
 
 @dataclass(frozen=True)
 class SpeedBox(_OfNoBody):
-    """|u_i| <= limit_i on every axis [m/s]: 2n rows."""
+    """|u_i| <= limit_i on every axis, in the units of the control: 2n rows. `quantity` names it in labels."""
 
     limit: tuple[float, ...]
     soft: bool = False
+    quantity: Literal["speed", "acceleration"] = "speed"
 
     def __post_init__(self) -> None:
         if not all(limit > 0 for limit in self.limit):
-            raise InputError("limit", "positive speeds [m/s]", self.limit)
+            raise InputError("limit", "positive limits [units of the control]", self.limit)
 
     def __call__(self, measurement: Measurement) -> Halfspaces:
         x = measurement.x
@@ -143,7 +155,7 @@ class SpeedBox(_OfNoBody):
         return RowErrors.none(self(measurement).b)
 
     def labels(self, bodies: Sequence[str]) -> list[str]:
-        return [f"speed {sign}{axis}" for sign in "+-" for axis in "xyz"[: len(self.limit)]]
+        return [f"{self.quantity} {sign}{axis}" for sign in "+-" for axis in "xyz"[: len(self.limit)]]
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ r"""The controller: the safety QP, and its control as a differentiable function 
 Some barriers limit the speed as well, |u| <= limit (`Barrier.speed_limit`), and some controllers take the control with
 the least violation where their rows are infeasible (`Barrier.relaxes`). See `speed_disc`.
 
-The control u* is the safe control nearest to uhat (`programmes.nearest_point`). It is exact. It is differentiable in
-theta, positions, gains and distances while the active set does not switch. At a switch the derivative is that of one
-side.
+The control u* is the safe control nearest to uhat (`programmes.nearest_point`), a velocity, or an acceleration for
+robots of second order. It is exact. It is differentiable in theta, positions, gains and distances while the active set
+does not switch. At a switch the derivative is that of one side.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.outcome import ProgrammeStatus
 from torchfsid.programmes.differentiable import broadcast, nearest
-from torchfsid.robots.barriers import Barrier, is_joint
+from torchfsid.robots.barriers import Barrier, is_joint, neighbours_controls
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.speed_disc import least_violation, nearest_in_disc
-from torchfsid.robots.tasks import Task
+from torchfsid.robots.tasks import Task, feedback_of
 
 
 class QpSolution(NamedTuple):
     """The solution of a batch of safety QPs.
 
     Attributes:
-        u: the controls [m/s]; zero where infeasible.
+        u: the controls; zero where infeasible.
         active: the rows with a positive multiplier, at most n. So it marks one of two equal rows, and two of three
             rows at a vertex.
         multipliers: mu_j >= 0 with uhat - u = 1/2 sum_j mu_j a_j, for the given rows a_j.
@@ -74,8 +74,9 @@ class Control:
     """The controls of a batch of robots.
 
     Attributes:
-        u: the control [m/s]; where infeasible, zero or the control with the least violation (`Barrier.relaxes`).
-        nominal: the nominal control uhat of the task [m/s].
+        u: the control, a velocity [m/s] or an acceleration [m/s2]; where infeasible, zero or the control with the least
+            violation (`Barrier.relaxes`).
+        nominal: the nominal control uhat of the task, in the same units.
         active: the rows with a positive multiplier (see `QpSolution`).
         feasible: whether some control satisfies the rows and the limit.
     """
@@ -90,9 +91,9 @@ class Control:
 class CbfQpController:
     """Follow the task as closely as the barriers allow: `controller(measurement, theta)`.
 
-    A barrier may use the neighbours' current velocities. If the measurement does not hold them, one QP decides for all
-    robots. The batch is then a team whose robot i is the body in slot i, and the other bodies stand still. One
-    infeasible robot stops the whole team.
+    A barrier may use the neighbours' current controls. If the measurement does not hold them, one QP decides for all
+    robots. The batch is then a team whose robot i is the body in slot i, and the controls of other bodies are zero. One
+    infeasible robot sets the controls of the whole team to zero.
 
     The controller keeps soft barriers like all others. `soft` matters only to observers.
 
@@ -121,9 +122,11 @@ class CbfQpController:
         try:
             uhat = (C.to(torch.float64) @ theta.to(torch.float64).unsqueeze(-1)).squeeze(-1) + d
             uhat = uhat if self.task.saturation is None else self.task.saturation(uhat)
+            feedback = feedback_of(self.task, measurement)
+            uhat = uhat if feedback is None else uhat + feedback
         except RuntimeError as error:
             raise InputError("theta", f"a batch that fits {tuple(d.shape[:-1])}", tuple(theta.shape)) from error
-        if measurement.body_velocities is None and is_joint(self.barriers):
+        if is_joint(self.barriers) and getattr(measurement, neighbours_controls(self.barriers)) is None:
             return self._team_control(measurement, uhat)
         safe_controls = Halfspaces.stack([barrier(measurement) for barrier in self.barriers])
         return self._within_limits(_control(safe_controls, uhat), safe_controls)
@@ -160,7 +163,7 @@ class CbfQpController:
         if bool(measurement.present.diagonal().any()):
             raise InputError("measurement", "robot i to be the body in slot i, for a joint QP", "another order")
         robots, n = uhat.shape
-        still = replace(measurement, body_velocities=torch.zeros_like(measurement.bodies))
+        still = replace(measurement, **{neighbours_controls(self.barriers): torch.zeros_like(measurement.bodies)})
         parts = [barrier(still) for barrier in self.barriers]
         own = torch.eye(robots, dtype=torch.float64, device=uhat.device).unsqueeze(1)
         blocks, pair_columns, column = [], [], 0

@@ -28,11 +28,13 @@ class LeftOut(NamedTuple):
         distance: a lower bound on their distances [m]; infinite if there are none.
         speed: an upper bound on their speeds [m/s]; NaN if unknown.
         radius: an upper bound on their radii [m]; NaN if unknown.
+        acceleration: an upper bound on their accelerations [m/s2]; NaN if unknown.
     """
 
     distance: Float[Tensor, "*batch"]
     speed: Float[Tensor, "*batch"]
     radius: Float[Tensor, "*batch"]
+    acceleration: Float[Tensor, "*batch"]
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,8 @@ class Measurement:
         left_out: the bodies without a slot; None if all have one. A sample for which they could matter is not used.
         velocity: velocities with which the robots arrive at t [m/s]: the state of robots of second order, and the
             controls of one sample earlier of robots of first order. None if unknown.
-        body_accelerations: the bodies' accelerations from t on [m/s2], among robots of second order.
+        body_accelerations: the bodies' accelerations from t on [m/s2]; NaN where unknown. None, unless the robots are
+            of second order and the controls are known.
         arrival_error: bounds on the error of `velocity` [m/s]; None for zero.
         body_acceleration_error: bounds on the errors of `body_accelerations` [m/s2]; None for zero.
     """
@@ -161,6 +164,11 @@ class Measurement:
         )
 
     @property
+    def is_second_order(self) -> bool:
+        """Are the controls accelerations?"""
+        return self.body_accelerations is not None
+
+    @property
     def time(self) -> float:
         """The common time of all robots [s].
 
@@ -209,7 +217,7 @@ class Measurement:
         times = [torch.as_tensor(p.t, dtype=torch.float64, device=p.x.device).expand(len(p.x)) for p in parts]
         left_out = None
         if any(part.left_out is not None for part in parts):
-            nobody = [part.x.new_tensor([[torch.inf], [0.0], [0.0]]).expand(3, len(part.x)) for part in parts]
+            nobody = [part.x.new_tensor([[torch.inf], [0.0], [0.0], [0.0]]).expand(4, len(part.x)) for part in parts]
             columns = zip(*(p.left_out or none.unbind() for p, none in zip(parts, nobody, strict=True)), strict=True)
             left_out = LeftOut(*map(torch.cat, columns))
         return cls(t=torch.cat(times), left_out=left_out, **{name: joined(name) for name in names})  # type: ignore[arg-type]

@@ -7,8 +7,9 @@ at the speed
     phi(r) = alpha(h)/|dh/dx|    [m/s],   which grows with r,
 
 So at the robot's control u its slack is at least phi(r) - |u| - |u_j|, the last term only if the row uses the
-neighbour's velocity. Let R be the least distance of a body without a slot, V the largest speed of these bodies, and
-`bound` the largest slack of an active row. The rows left out are inactive if
+neighbour's velocity. (`second_order` has the bound for accelerations.) Let R be the least distance of a body without a
+slot, V the largest speed of these bodies, and `bound` the largest slack of an active row. The rows left out are
+inactive if
 
     phi(R) - |u| - V > bound.
 
@@ -31,6 +32,7 @@ from torch import Tensor
 
 from torchfsid.errors import InputError
 from torchfsid.robots.barriers import Barrier
+from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.measurement import LeftOut, Measurement
 
 
@@ -47,6 +49,8 @@ def nearest_bodies(
     seen: Bool[Tensor, "bodies"] | Bool[np.ndarray, "bodies"] | None = None,
     position_error: Float[Tensor, "bodies"] | Float[np.ndarray, "bodies"] | None = None,
     velocity_error: Float[Tensor, "bodies"] | Float[np.ndarray, "bodies"] | None = None,
+    acceleration: Float[Tensor, "bodies n"] | Float[np.ndarray, "bodies n"] | None = None,
+    acceleration_error: Float[Tensor, "bodies"] | Float[np.ndarray, "bodies"] | None = None,
 ) -> Measurement:
     """The batch of the inferred `robots`, each with slots for its `count` nearest bodies `within` a distance [m].
 
@@ -64,10 +68,13 @@ def nearest_bodies(
         seen: the bodies measured at t; default all. Others are no obstacles, and unobserved if they are robots.
         position_error: bounds on the errors of `x` [m].
         velocity_error: bounds on the errors of `u` and `previous_u` [m/s].
+        acceleration: accelerations from t on, the controls of robots of second order [m/s2]. Their `u` is a state.
+        acceleration_error: bounds on the errors of `acceleration` [m/s2].
 
     Raises:
-        InputError: an argument has the wrong shape or type, an index in `robots` is no body, a position of a body that
-            was seen is not finite, or `count` or `within` is not positive.
+        InputError: an argument has the wrong shape or type, there are accelerations without velocities, an index in
+            `robots` is no body, a position of a body that was seen is not finite, or `count` or `within` is not
+            positive.
     """
     x = _numbers("x", x)
     if x.ndim != 2:
@@ -77,9 +84,18 @@ def nearest_bodies(
     if not within > 0:
         raise InputError("within", "a positive distance [m]", within)
     index = _indices(robots, x)
-    u, previous_u = (_of_bodies(name, v, x.shape, x) for name, v in (("u", u), ("previous_u", previous_u)))
-    sized = {"radius": radius, "position_error": position_error, "velocity_error": velocity_error}
-    radius, position_error, velocity_error = (_of_bodies(name, v, x.shape[:1], x) for name, v in sized.items())
+    vectors = {"u": u, "previous_u": previous_u, "acceleration": acceleration}
+    u, previous_u, acceleration = (_of_bodies(name, v, x.shape, x) for name, v in vectors.items())
+    if acceleration is not None and u is None:
+        raise InputError("u", "velocities, beside the accelerations", None)
+    errors = {"position_error": position_error, "velocity_error": velocity_error}
+    sized = {"radius": radius, **errors, "acceleration_error": acceleration_error}
+    radius, position_error, velocity_error, acceleration_error = (
+        _of_bodies(name, v, x.shape[:1], x) for name, v in sized.items()
+    )
+    state, control, control_error = previous_u, u, velocity_error
+    if acceleration is not None:
+        state, control, control_error = u, acceleration, acceleration_error
     was_seen = torch.ones(len(x), dtype=torch.bool, device=x.device) if seen is None else _seen(seen, x)
     lost = (was_seen & ~x.isfinite().all(-1)).nonzero().flatten().tolist()
     if lost:
@@ -102,27 +118,45 @@ def nearest_bodies(
     if not bool(next_one.isinf().all() & present.all()):
         speeds = [v.norm(dim=-1) for v in (u, previous_u) if v is not None]
         speed = largest(torch.stack(speeds).amax(0) if speeds else None) + largest(velocity_error, 0.0)
+        pull = largest(None if acceleration is None else acceleration.norm(dim=-1)) + largest(acceleration_error, 0.0)
         away = (next_one.clamp(max=within) - largest(position_error, 0.0)).clamp(min=0.0)
-        left_out = LeftOut(away, speed.expand(len(index)), largest(radius).expand(len(index)))
+        left_out = LeftOut(away, *(bound.expand(len(index)) for bound in (speed, largest(radius), pull)))
     return Measurement(
         t=t,
         x=x[index],
-        u=own(u),
+        u=own(control),
         bodies=x[slots],
         present=present,
-        velocity=own(previous_u),
+        velocity=own(state),
         body_velocities=of_slots(u),
         previous_body_velocities=of_slots(previous_u),
+        body_accelerations=of_slots(acceleration),
         radius=own(radius),
         body_radii=of_slots(radius),
         observed=None if seen is None else was_seen[index],
         position_error=own(position_error),
         body_position_error=of_slots(position_error),
-        velocity_error=own(velocity_error),
+        velocity_error=own(control_error),
         body_velocity_error=of_slots(velocity_error),
         arrival_error=own(velocity_error),
+        body_acceleration_error=of_slots(acceleration_error),
         left_out=left_out,
     )
+
+
+def within_bounds(measurement: Measurement, noise: NoiseBound) -> Measurement:
+    """The measurement with the declared bounds on velocities and accelerations added to what it says of itself.
+
+    That is, to `arrival_error`, and to what the bodies without a slot may do.
+    """
+    left_out, error = measurement.left_out, measurement.arrival_error
+    assert left_out is not None
+    arrival = torch.full_like(measurement.x[..., 0], noise.arrival)
+    faster = left_out._replace(
+        speed=left_out.speed + noise.neighbour_velocity,
+        acceleration=left_out.acceleration + noise.neighbour_acceleration,
+    )
+    return replace(measurement, arrival_error=arrival if error is None else arrival + error, left_out=faster)
 
 
 def left_out_inactive(
@@ -136,7 +170,7 @@ def left_out_inactive(
     Args:
         barriers: the barriers of the robots.
         measurement: the measurement, with the bodies that it leaves out.
-        bound: the largest slack of an active row [m/s].
+        bound: the largest slack of an active row, in units of the control.
         error: a bound on the error of the distance to a body [m].
 
     Raises:

@@ -2,10 +2,14 @@ r"""Sampled simulation of robots in closed loop: the measurements for an observe
 
     x_i(t + dt) = x_i(t) + dt (u_i(t) + w_i(t)),     u_i(t) = u*(x(t); theta_i)        (G., Eqs. (4), (5))
 
-The control is held for dt. The disturbance w is optional. All robots compute at the same time, from the positions at t.
-`closed_loop` runs robots in any surroundings, sample by sample. `simulate` runs teams: every robot avoids every other
-and the obstacles, which stand still. Both are differentiable in theta, start, the positions of the bodies, gains and
-distances.
+Robots of second order are driven by accelerations u. With their velocities v,
+
+    x(t + dt) = x(t) + dt v(t) + dt^2/2 (u(t) + w(t)),     v(t + dt) = v(t) + dt (u(t) + w(t)).
+
+The control is held for dt, so both are exact. The disturbance w is optional. All robots compute at the same time, from
+the positions (and velocities) at t. `closed_loop` runs robots in any surroundings, sample by sample. `simulate` runs
+teams: every robot avoids every other and the obstacles, which stand still. Both are differentiable in theta, start, the
+positions of the bodies, gains and distances.
 """
 
 from __future__ import annotations
@@ -28,10 +32,14 @@ STILL = 1e-3
 IDLE = 1e-6
 """... and that nominal speed is above this one [m/s]: below it, it has nowhere to go."""
 
-Surroundings = Callable[[float, Tensor, Tensor], Measurement]
-"""What the robots have around them, as a measurement without controls: (t, x, previous_u) -> measurement.
+AT_REST = 1e-3
+"""A robot of second order rests where its speed is at most this [m/s]."""
 
-`t` is the time [s], `x` are the robots' positions [m], `previous_u` their velocities one sample earlier [m/s].
+Surroundings = Callable[[float, Tensor, Tensor], Measurement]
+"""What the robots have around them, as a measurement without controls: (t, x, v) -> measurement.
+
+`t` is the time [s], `x` are the robots' positions [m], `v` the velocities with which they arrive there [m/s]: those of
+one sample earlier, or the states of robots of second order.
 """
 
 
@@ -39,8 +47,8 @@ class Sample(NamedTuple):
     """One instant of a closed loop.
 
     Attributes:
-        measurement: the input of the controller, with the velocities that the robots executed from then on.
-        control: the output of the controller. Where the QP is infeasible the robot stands still.
+        measurement: the input of the controller, with the controls that the robots executed from then on.
+        control: the output of the controller. Where the QP is infeasible it is zero.
     """
 
     measurement: Measurement
@@ -60,6 +68,7 @@ def closed_loop(
     *,
     dt: float,
     samples: int,
+    velocity: Float[Tensor, "*batch n"] | None = None,
     disturbance: Float[Tensor, "samples *batch n"] | None = None,
 ) -> Iterator[Sample]:
     """Run a batch of robots and yield one sample after the other. Past samples are not kept.
@@ -71,15 +80,20 @@ def closed_loop(
         surroundings: a function that returns the measurement of the robots' surroundings, called at every sample.
         dt: time between samples [s].
         samples: the number of samples.
-        disturbance: velocities that are added to the controls [m/s].
+        velocity: the velocities of robots of second order at the first sample [m/s]. None: of first order.
+        disturbance: added to the controls, in their units.
     """
-    x, u = start.to(torch.float64), torch.zeros_like(start, dtype=torch.float64)
+    x = start.to(torch.float64)
+    v = torch.zeros_like(x) if velocity is None else velocity.to(torch.float64)
     for k in range(samples):
-        seen = surroundings(k * dt, x, u)
+        seen = surroundings(k * dt, x, v)
         control = controller(seen, theta)
         u = control.u if disturbance is None else control.u + disturbance[k]
         yield Sample(replace(seen, u=u), control)
-        x = x + dt * u
+        if velocity is None:
+            x, v = x + dt * u, u
+        else:
+            x, v = x + dt * v + dt**2 / 2 * u, v + dt * u
 
 
 @dataclass(frozen=True)
@@ -89,11 +103,13 @@ class Trajectory:
     Attributes:
         t: times [s].
         x: positions of all bodies [m].
-        u: their velocities from t on [m/s]; zero for obstacles, and for a robot whose QP is infeasible.
-        nominal: the nominal controls of the robots' tasks [m/s].
+        u: their controls from t on, velocities [m/s] or accelerations [m/s2]; zero for obstacles, and for a robot
+            whose QP is infeasible.
+        nominal: the nominal controls of the robots' tasks.
         active: the robots' rows with a positive multiplier, in the order of the controller's barriers.
         feasible: whether the robot's QP had a solution.
         radius: the radii of all bodies [m], if given.
+        velocity: the velocities of all bodies at t [m/s], among robots of second order.
     """
 
     t: Float[Tensor, "samples"]
@@ -103,6 +119,7 @@ class Trajectory:
     active: Bool[Tensor, "samples *teams robots m"]
     feasible: Bool[Tensor, "samples *teams robots"]
     radius: Float[Tensor, "*#teams bodies"] | None = None
+    velocity: Float[Tensor, "samples *teams bodies n"] | None = None
 
     @property
     def robots(self) -> int:
@@ -117,14 +134,21 @@ class Trajectory:
         """
         with torch.no_grad():
             stuck = stands_still(self.u[..., : self.robots, :], self.nominal)
+            if self.velocity is not None:
+                stuck = stuck & (self.velocity[..., : self.robots, :].norm(dim=-1) <= AT_REST)
             until_the_end = stuck.flip(0).long().cumprod(0).sum(0)
             since = self.t[(len(self.t) - until_the_end).clamp(max=len(self.t) - 1)]
             return torch.where(until_the_end > 0, since, torch.nan)
 
     def measurement(self, k: int) -> Measurement:
         """The measurement of the robots at sample `k`. Before the first sample all velocities are zero."""
-        before = torch.zeros_like(self.u[k]) if k == 0 else self.u[k - 1]
-        return _of_teams(float(self.t[k]), self.x[k], self.u[k], before, self.robots, self.radius)
+        if self.velocity is None:
+            arrival = torch.zeros_like(self.u[k]) if k == 0 else self.u[k - 1]
+        else:
+            arrival = self.velocity[k]
+        return _of_teams(
+            float(self.t[k]), self.x[k], arrival, self.u[k], self.robots, self.radius, self.velocity is not None
+        )
 
     def measurements(self) -> Iterator[Measurement]:
         """All samples, in the order of time."""
@@ -138,14 +162,15 @@ def simulate(
     *,
     dt: float,
     steps: int,
+    velocity: Float[Tensor, "*teams robots n"] | None = None,
     obstacles: Float[Tensor, "*#teams obstacles n"] | None = None,
     radius: Float[Tensor, "*#teams bodies"] | None = None,
 ) -> Trajectory:
     """Run a team, or a batch of teams, for `steps` steps. The result has steps + 1 samples, all with controls.
 
     The barriers choose the neighbours' velocities: none, those of one sample ago (zero at the first), or the current
-    ones. Current velocities need one QP over the team, and one team at a time. A robot whose QP is infeasible stands
-    still for that step, and the run goes on.
+    ones. Current velocities (of robots of second order: accelerations) need one QP over the team, and one team at a
+    time. A robot whose QP is infeasible has the control zero for that step, and the run goes on.
 
     Args:
         controller: the controller of all robots.
@@ -153,6 +178,7 @@ def simulate(
         start: their first positions [m].
         dt: length of a step [s].
         steps: the number of steps.
+        velocity: the velocities of robots of second order at the start [m/s]. None: the robots are of first order.
         obstacles: positions of bodies that stand still [m]. Their slots come after the robots'.
         radius: radii of all bodies, robots first [m], for barriers given by a margin.
 
@@ -169,6 +195,8 @@ def simulate(
     if theta.ndim != start.ndim or theta.shape[:-1] != start.shape[:-1]:
         expected = f"parameters ({', '.join(map(str, (*teams, robots)))}, p), one row per robot"
         raise InputError("theta", expected, tuple(theta.shape))
+    if velocity is not None and (velocity.shape != start.shape or not bool(velocity.isfinite().all())):
+        raise InputError("velocity", f"finite velocities {tuple(start.shape)}", velocity)
     if radius is not None and radius.shape[-1:] != (bodies,):
         raise InputError("radius", f"(*teams, {bodies}), robots first, then obstacles", tuple(radius.shape))
     if not (dt > 0 and steps > 0):
@@ -179,20 +207,27 @@ def simulate(
         raise InputError("obstacles", f"teams {tuple(teams)}, or none", tuple(obstacles.shape)) from error
     at_rest = torch.zeros_like(standing)
 
-    def surroundings(t: float, x: Tensor, previous_u: Tensor) -> Measurement:
-        everywhere, before = torch.cat([x, standing], dim=-2), torch.cat([previous_u, at_rest], dim=-2)
-        return _of_teams(t, everywhere, None, before, robots, radius)
+    def with_obstacles(of_robots: Tensor, of_obstacles: Tensor) -> Tensor:
+        return torch.cat([of_robots, of_obstacles], dim=-2)
 
-    samples = list(closed_loop(controller, theta, start, surroundings, dt=dt, samples=steps + 1))
+    states = []
+
+    def surroundings(t: float, x: Tensor, v: Tensor) -> Measurement:
+        x, v = with_obstacles(x, standing), with_obstacles(v, at_rest)
+        states.append((x, v))
+        return _of_teams(t, x, v, None, robots, radius, velocity is not None)
+
+    samples = list(closed_loop(controller, theta, start, surroundings, dt=dt, samples=steps + 1, velocity=velocity))
     controls = [sample.control for sample in samples]
     return Trajectory(
         t=dt * torch.arange(steps + 1, dtype=torch.float64, device=start.device),
-        x=torch.stack([torch.cat([sample.measurement.x, standing], dim=-2) for sample in samples]),
-        u=torch.stack([torch.cat([control.u, at_rest], dim=-2) for control in controls]),
+        x=torch.stack([x for x, _ in states]),
+        u=torch.stack([with_obstacles(control.u, at_rest) for control in controls]),
         nominal=torch.stack([control.nominal for control in controls]),
         active=torch.stack([control.active for control in controls]),
         feasible=torch.stack([control.feasible for control in controls]),
         radius=radius,
+        velocity=None if velocity is None else torch.stack([v for _, v in states]),
     )
 
 
@@ -203,9 +238,9 @@ def stands_still(u: Float[Tensor, "*batch n"], nominal: Float[Tensor, "*batch n"
 
 
 def _of_teams(
-    t: float, x: Tensor, u: Tensor | None, previous_u: Tensor, robots: int, radius: Tensor | None
+    t: float, x: Tensor, v: Tensor, u: Tensor | None, robots: int, radius: Tensor | None, second_order: bool
 ) -> Measurement:
-    """`Measurement.of_team` for a batch of teams whose first bodies are the robots."""
+    """`Measurement.of_team` for a batch of teams whose first bodies are the robots, which arrive with velocities v."""
     teams, bodies = x.shape[:-2], x.shape[-2]
     slot = torch.arange(bodies, device=x.device)
     radius = None if radius is None else radius.to(torch.float64).expand(*teams, bodies)
@@ -213,14 +248,17 @@ def _of_teams(
     def among(of_bodies: Tensor) -> Tensor:
         return of_bodies.unsqueeze(len(teams)).expand(*teams, robots, *of_bodies.shape[len(teams) :])
 
+    controls = None if u is None else among(u)
     return Measurement(
         t=t,
         x=x[..., :robots, :],
         u=None if u is None else u[..., :robots, :],
         bodies=among(x),
         present=(slot != slot[:robots, None]).expand(*teams, robots, bodies),
-        body_velocities=None if u is None else among(u),
-        previous_body_velocities=among(previous_u),
+        velocity=v[..., :robots, :],
+        body_velocities=among(v) if second_order else controls,
+        previous_body_velocities=None if second_order else among(v),
+        body_accelerations=controls if second_order else None,
         radius=None if radius is None else radius[..., :robots],
         body_radii=None if radius is None else among(radius),
     )

@@ -2,7 +2,8 @@ r"""Tasks: nominal controls that are affine in an unknown parameter (G., Sec. II
 
     uhat(x; theta) = C(x) theta + d(x),      C (*batch, n, p),  d (*batch, n).
 
-Every task is a frozen record. Called with a `Measurement`, it returns (C, d). The paper asks for such a library of
+The control uhat is a velocity [m/s], or an acceleration [m/s2] for robots of second order. Every task is a frozen
+record. Called with a `Measurement`, it returns (C, d). The paper asks for such a library of
 task-to-function mappings. The robots of its experiments use `GoalTask`: C = kp I, d = -kp x, theta = x_d.
 """
 
@@ -32,9 +33,9 @@ class Saturation:
 
     Attributes:
         shape: `norm` for |uhat| <= v, `box` for |uhat_i| <= v_i.
-        limits: the v_i [m/s]. For `norm` both are v. Infinite if there is a dead zone only.
-        dead_speed: the speed below which the control is zero [m/s]. For a goal it is the gain times the radius of the
-            dead zone.
+        limits: the v_i, in the units of the control. For `norm` both are v. Infinite if there is a dead zone only.
+        dead_speed: the size below which the control is zero, in its units. For a goal it is the gain times the radius
+            of the dead zone.
     """
 
     shape: Literal["norm", "box"]
@@ -43,9 +44,13 @@ class Saturation:
 
     def __post_init__(self) -> None:
         if not (min(self.limits) >= self.dead_speed >= 0 and min(self.limits) > 0):
-            raise InputError("saturation", "positive limits >= dead_speed >= 0 [m/s]", (self.limits, self.dead_speed))
+            raise InputError("saturation", "positive limits >= dead_speed >= 0", (self.limits, self.dead_speed))
         if self.shape == "norm" and self.limits[0] != self.limits[1]:
             raise InputError("saturation.limits", "one limit, twice, for a norm", self.limits)
+
+    def scaled(self, factor: float) -> Saturation:
+        """The saturation of `factor` times the control."""
+        return Saturation(self.shape, (factor * self.limits[0], factor * self.limits[1]), factor * self.dead_speed)
 
     def __call__(self, y: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
         speed = y.square().sum(-1, keepdim=True).clamp(min=1e-300).sqrt()
@@ -68,6 +73,11 @@ class Task(Protocol):
         uncertainty(measurement, corners)   (*batch): a bound on the error of C theta + d [m/s], for theta in the hull
                                             of the corners (*batch, v, p).
 
+    Two more are for tasks whose robots add a known control after clipping, uhat = clip(C theta + d) + feedback:
+
+        feedback(measurement)               (*batch, n), or None.
+        feedback_error(bounds)              (*batch): a bound on its error.
+
     `parameter_names` holds the names of the p entries of theta. `task(measurement)` returns C (*batch, n, p) and
     d (*batch, n).
     """
@@ -81,8 +91,13 @@ class Task(Protocol):
     def __call__(self, measurement: Measurement) -> Affine: ...
 
     def drift(self, bounds: ErrorBounds, largest: Float[Tensor, "*batch p"]) -> Float[Tensor, "*batch"]:
-        """A bound on the error of C theta + d [m/s], given `bounds` on position errors and |theta_i| <= largest_i."""
+        """A bound on the error of C theta + d [m/s], given `bounds` on the measurement and |theta_i| <= largest_i."""
         ...
+
+
+def feedback_of(task: Task, measurement: Measurement) -> Float[Tensor, "*batch n"] | None:
+    """The known control that the task adds after clipping. None if it adds none."""
+    return task.feedback(measurement) if hasattr(task, "feedback") else None  # type: ignore[attr-defined]
 
 
 def _positive(name: str, value: float | Tensor) -> None:
@@ -94,22 +109,56 @@ def _identity_like(x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n n"]:
     return torch.eye(x.shape[-1], dtype=x.dtype, device=x.device).expand(*x.shape, x.shape[-1])
 
 
+def _velocity(measurement: Measurement) -> Float[Tensor, "*batch n"]:
+    if measurement.velocity is None:
+        raise InputError("measurement.velocity", "the velocities of the robots, of second order", None)
+    return measurement.velocity
+
+
 @dataclass(frozen=True)
 class GoalTask:
     """Go to a goal: uhat = gain (theta - x), theta the goal [m], gain [1/s] (G., Sec. III).
 
-    The gain may be wrong by at most `gain_error` [1/s].
+    For robots of second order uhat is an acceleration and the gain in [1/s2]:
+
+        uhat = clip(gain (theta - x) - damping v) - loop v
+
+    Attributes:
+        gain: the gain.
+        parameter_names: see `Task`.
+        saturation: how the nominal control is clipped.
+        gain_error: a bound on the error of the gain.
+        damping: of the velocity v, before clipping [1/s].
+        loop: of the velocity v, after clipping [1/s] (`in_velocity_loop`).
     """
 
     gain: float | Tensor
     parameter_names: tuple[str, ...] = ("goal_x", "goal_y")
     saturation: Saturation | None = None
     gain_error: float = 0.0
+    damping: float = 0.0
+    loop: float = 0.0
 
     def __post_init__(self) -> None:
         _positive("gain", self.gain)
-        if not self.gain_error >= 0:
-            raise InputError("gain_error", "a bound >= 0 [1/s]", self.gain_error)
+        for name in ("gain_error", "damping", "loop"):
+            if not getattr(self, name) >= 0:
+                raise InputError(name, "a number >= 0", getattr(self, name))
+
+    @classmethod
+    def in_velocity_loop(
+        cls, gain: float, loop: float, saturation: Saturation | None = None, gain_error: float = 0.0
+    ) -> GoalTask:
+        """Robots whose velocity follows a goal task: uhat = loop (clip(gain (theta - x)) - v), an acceleration.
+
+        Args:
+            gain: of the velocity that is followed [1/s].
+            loop: of the velocity loop [1/s].
+            saturation: of that velocity, limits in [m/s].
+            gain_error: a bound on the error of the gain [1/s].
+        """
+        scaled = None if saturation is None else saturation.scaled(loop)
+        return cls(loop * gain, saturation=scaled, gain_error=loop * gain_error, loop=loop)
 
     @property
     def uncertain(self) -> bool:
@@ -120,10 +169,19 @@ class GoalTask:
         return self.gain_error * (corners - measurement.x.unsqueeze(-2)).norm(dim=-1).amax(-1)
 
     def __call__(self, measurement: Measurement) -> Affine:
-        return self.gain * _identity_like(measurement.x), -self.gain * measurement.x
+        d = -self.gain * measurement.x
+        if self.damping > 0:
+            d = d - self.damping * _velocity(measurement)
+        return self.gain * _identity_like(measurement.x), d
 
     def drift(self, bounds: ErrorBounds, largest: Tensor) -> Tensor:
-        return (self.gain + self.gain_error) * bounds.position
+        return (self.gain + self.gain_error) * bounds.position + self.damping * bounds.velocity
+
+    def feedback(self, measurement: Measurement) -> Float[Tensor, "*batch n"] | None:
+        return -self.loop * _velocity(measurement) if self.loop > 0 else None
+
+    def feedback_error(self, bounds: ErrorBounds) -> Float[Tensor, "*batch"]:
+        return self.loop * bounds.velocity
 
 
 @dataclass(frozen=True)
