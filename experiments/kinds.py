@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from experiments.design.config import LearnedObserverConfig, ProbePlacementConfig
-from experiments.runs.config import CasesConfig, SceneConfig, SwarmConfig
+from experiments.runs.config import CasesConfig, SceneConfig
+from experiments.runs.swarm_config import SwarmConfig
 from experiments.sweeps.config import SweepConfig, override_sweep
 from torchfsid.config.documents import Strict, apply_overrides, read_yaml, validate
 from torchfsid.errors import ConfigError

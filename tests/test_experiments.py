@@ -16,9 +16,9 @@ import torch
 from experiments.__main__ import main
 from experiments.figures.style import length
 from experiments.kinds import KINDS, load
-from experiments.runs.config import CasesConfig, ExpectedConfig, SceneConfig
+from experiments.runs.config import SETS, CasesConfig, ExpectedConfig, SceneConfig
 from experiments.runs.recording import simulate_scene
-from experiments.runs.saved import SETS, Results
+from experiments.runs.saved import Results
 from experiments.runs.summary import compare, stays_below, timeline
 from torchfsid.commands.results_folder import write_json
 from torchfsid.config.documents import dump
@@ -106,7 +106,7 @@ def test_configs_load_and_survive_being_written(name: str, tmp_path: Path):
         ("robots.0.start=[1]", "robots[0].start"),
         ("robots.0.name=1", "robots, obstacles"),
         ("barriers.0.safety_distance=0", "barriers[0].safety_distance"),
-        ("barriers.0={kind: avoidance, margin: 0.1, class_k: {gain: 1}}", "barriers[0].margin"),
+        ("barriers.0={kind: avoidance, margin: 0.1, class_k: {gain: 1}}", "radius"),
         ("snapshots=[2, 1]", "snapshots"),
         ("snapshots=[9]", "snapshots"),
         ("seed=-1", "seed"),

@@ -12,7 +12,7 @@ import pytest
 
 from experiments.__main__ import main
 from experiments.kinds import load
-from experiments.runs.config import SwarmConfig
+from experiments.runs.swarm_config import SwarmConfig
 
 SWARM = Path(__file__).parents[1] / "configs" / "swarm.yaml"
 SMALL = ("robots=60", "side=7.5", "duration=0.9", "snapshots=[0.3, 0.9]")

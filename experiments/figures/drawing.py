@@ -1,6 +1,7 @@
 """Common parts of the figures: headings, curves, entries of legends, and the map with its bodies and regions.
 
-A body, the robot included, is a disc of radius Ds/2. Two discs that touch are at the safety distance.
+A body, the robot included, is a disc of its radius, or else of radius Ds/2. Two discs of radius Ds/2 that touch are at
+the safety distance.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ SMALLEST = 1e-12
 """Half the side of a box around a point [m]."""
 
 NO_RADIUS = 0.1
-"""Radius of a disc in a scene without safety distance [m]."""
+"""Radius of a disc in a scene without radius and safety distance [m]."""
 
 
 def headline(figure: Figure, text: str) -> None:
@@ -49,7 +50,7 @@ def positive(values: np.ndarray) -> np.ndarray:
 
 def add_curves(axes: Axes, t: np.ndarray, measures: Mapping[str, np.ndarray]) -> None:
     """Draw the sizes and errors of one robot over time."""
-    for measure, label, looks in CURVES:
+    for measure, label, looks in (curve for curve in CURVES if curve[0] in measures):
         axes.semilogy(t, positive(measures[measure]), label=label, **looks)
     axes.grid(True)
     axes.set_xlim(t[0], t[-1])
@@ -57,6 +58,8 @@ def add_curves(axes: Axes, t: np.ndarray, measures: Mapping[str, np.ndarray]) ->
 
 def disc_radius(config: SceneConfig) -> float:
     """The radius in which bodies are drawn [m]."""
+    if config.radius is not None:
+        return config.radius
     return NO_RADIUS if config.safety_distance is None else config.safety_distance / 2
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from string import ascii_lowercase
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.legend_handler import HandlerTuple
 from matplotlib.patches import Patch, Rectangle
@@ -15,16 +18,15 @@ from experiments.figures.style import (
     ACTIVE,
     HYBRID,
     INACTIVE,
-    INVERSE_OPTIMAL,
-    REGION,
     ROBOT,
     SET_COLOURS,
+    SET_NAMES,
     UKF,
     length,
 )
 from experiments.runs.config import SceneConfig
 from experiments.runs.lengths import lengths
-from experiments.runs.saved import SETS, Results
+from experiments.runs.saved import Results
 
 ASPECT = 1.25
 """Width / height of the maps."""
@@ -53,13 +55,14 @@ def draw_single(results: Results, config: SceneConfig) -> Figure:
     drawing.name_panel(errors, count, " sizes and errors [m]", pad=13)
     _draw_strip(strip, results)
     drawing.headline(figure, f"{config.title}   {_settings(config)}")
-    _add_legends(figure, errors)
+    _add_legends(figure, errors, config.sets)
     return figure
 
 
 def _draw_map(axes: Axes, results: Results, config: SceneConfig, k: int, box: tuple[np.ndarray, np.ndarray]) -> None:
     region, path = results.regions[k][0], results.paths[config.robots[0].name]
-    drawing.add_region(axes, region.vertices["critical_region"], REGION, filled=True)
+    first = config.sets[0]
+    drawing.add_region(axes, region.vertices[first], SET_COLOURS[first], filled=True)
     drawing.add_obstacles(axes, config, region.active)
     axes.plot(*path[: k + 1].T, color=ROBOT, lw=1.1, zorder=4.5)
     drawing.add_robot(axes, path[k], drawing.disc_radius(config), ROBOT)
@@ -72,21 +75,22 @@ def _draw_map(axes: Axes, results: Results, config: SceneConfig, k: int, box: tu
 def _draw_region(axes: Axes, results: Results, k: int, box: tuple[np.ndarray, np.ndarray]) -> None:
     """The region about the goal, to its own scale. A dashed frame is the frame of the map."""
     region, goal = results.regions[k][0], results.goals[0]
-    for kind, filled in (("critical_region", True), ("inverse_optimal", False)):
-        drawn = drawing.add_region(axes, region.vertices[kind] - goal, SET_COLOURS[kind], filled=filled)
-        if not filled:
+    first, *others = results.config.sets
+    for kind in results.config.sets:
+        drawn = drawing.add_region(axes, region.vertices[kind] - goal, SET_COLOURS[kind], filled=kind == first)
+        if kind in others:
             drawn.set(linestyle=(0, (3, 2)), zorder=1.5)
     drawing.add_goal(axes, (0.0, 0.0))
     _add_estimates(axes, results, k, goal)
-    vertices = np.vstack([region.vertices["critical_region"] - goal, np.zeros((1, 2))])
+    vertices = np.vstack([region.vertices[first] - goal, np.zeros((1, 2))])
     drawing.frame(axes, drawing.padded(vertices.min(0), vertices.max(0), ASPECT, 1.25))
     lower, upper = box
     drawing.add_box(axes, (lower - goal, upper - goal), ec="0.45", lw=0.7, ls=(0, (1, 1.5)))
     axes.set_xlabel("x − goal [m]")
     axes.locator_params(nbins=5)
-    region_size, other_size = (length(np.sqrt(results.of_set(kind, "volume")[k, 0])) for kind in SETS)
-    axes.set_title(f"√area {region_size}", loc="left", color=REGION, fontsize=8)
-    axes.set_title(f"√area {other_size}", loc="right", color=INVERSE_OPTIMAL, fontsize=8)
+    for kind, side in zip(results.config.sets, ("left", "right"), strict=False):
+        size = length(np.sqrt(results.of_set(kind, "volume")[k, 0]))
+        axes.set_title(f"√area {size}", loc=side, color=SET_COLOURS[kind], fontsize=8)
 
 
 def _add_estimates(axes: Axes, results: Results, k: int, origin: np.ndarray) -> None:
@@ -118,27 +122,29 @@ def _draw_strip(axes: Axes, results: Results) -> None:
 
 def _settings(config: SceneConfig) -> str:
     lower, upper = (", ".join(f"{x:g}" for x in corner) for corner in (config.prior.lower, config.prior.upper))
+    filtered = length(config.ukf.position_noise) + ("/s" if config.dynamics == "double_integrator" else "")
     return (
-        f"dt = {config.dt:g} s, prior [{lower}] to [{upper}] m, UKF: √R = {length(config.ukf.position_noise)}, "
-        f"inverse-optimal bound {config.noise.velocity:g} m/s"
+        f"dt = {config.dt:g} s, prior [{lower}] to [{upper}] m, UKF: √R = {filtered}, "
+        f"inverse-optimal bound {config.noise.control:g} {config.noise.unit}"
     )
 
 
-def _add_legends(figure: Figure, errors: Axes) -> None:
+def _add_legends(figure: Figure, errors: Axes, kinds: Sequence[str]) -> None:
     obstacles = tuple(drawing.marker("o", colour, ms=8, mec="0.4") for colour in (ACTIVE, INACTIVE))
+    patches = [Patch(facecolor=(*to_rgb(SET_COLOURS[kinds[0]]), 0.25), edgecolor=SET_COLOURS[kinds[0]])]
+    patches += [Patch(facecolor="none", edgecolor=SET_COLOURS[kind], ls=(0, (3, 2))) for kind in kinds[1:]]
     entries = [
         (drawing.marker("o", ROBOT, ms=9), "robot"),
         (drawing.marker("*", "black", ms=10), "goal"),
         (obstacles, "obstacle: active, inactive"),
         (Rectangle((0, 0), 1, 1, fill=False, ec="0.45", ls=(0, (1, 1.5))), "frame of the map above"),
-        (Patch(facecolor="#BFE7DC", edgecolor=REGION), "paper's region"),
-        (Patch(facecolor="none", edgecolor=INVERSE_OPTIMAL, ls=(0, (3, 2))), "inverse-optimal set"),
+        *zip(patches, map(SET_NAMES.get, kinds), strict=True),
         (drawing.marker("x", UKF, ms=7, mew=1.8), "UKF"),
         (drawing.marker("D", HYBRID, ms=6.5, mfc="none", mew=1.4), "hybrid estimate"),
     ]
     handles, labels = zip(*entries, strict=True)
     looks = {"handler_map": {tuple: HandlerTuple(None)}, "columnspacing": 1.6}
-    figure.legend(handles, labels, loc="outside lower left", ncols=len(entries) // 2, **looks)
+    figure.legend(handles, labels, loc="outside lower left", ncols=math.ceil(len(entries) / 2), **looks)
     figure.legend(
         *errors.get_legend_handles_labels(), loc="outside lower right", ncols=3, columnspacing=1.0, handlelength=2
     )

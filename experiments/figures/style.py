@@ -48,7 +48,7 @@ def team_colours(config: SceneConfig) -> list[str]:
 
 
 SET_COLOURS = {"critical_region": REGION, "inverse_optimal": INVERSE_OPTIMAL}
-SET_NAMES = {"critical_region": "paper's region Θ", "inverse_optimal": "inverse-optimal set"}
+SET_NAMES = {"critical_region": "paper's region", "inverse_optimal": "inverse-optimal set"}
 
 
 CURVES: tuple[tuple[str, str, dict[str, Any]], ...] = (

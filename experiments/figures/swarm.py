@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from experiments.figures.drawing import NO_RADIUS, frame, headline, name_panel
 from experiments.figures.style import INVERSE_OPTIMAL
 from experiments.results import Columns, read_columns, read_json, reading
-from experiments.runs.config import SwarmConfig
+from experiments.runs.swarm_config import SwarmConfig
 
 COLOURS = "viridis_r"
 

@@ -5,7 +5,7 @@ The rows show whether each set holds the truth, sizes and errors over time, and 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,14 +20,17 @@ from experiments.sweeps.config import SweepConfig
 from experiments.sweeps.swept import Swept, quantiles, short
 
 BAND = (0.1, 0.9)
-LEGEND_WIDTH = 1.6
+LEGEND_WIDTH = 2.0
 """Of an entry, on average [inches]."""
 
-SIZES = (
+Measure = tuple[str, str, str]
+"""A column of the series, its label, its colour."""
+
+SIZES: tuple[Measure, ...] = (
     ("inverse_optimal_sqrt_area", "inverse-optimal set", INVERSE_OPTIMAL),
     ("critical_region_sqrt_area", "paper's region", REGION),
 )
-ERRORS = (("ukf_error", "UKF", UKF), ("hybrid_error", "hybrid", HYBRID))
+ERRORS: tuple[Measure, ...] = (("ukf_error", "UKF", UKF), ("hybrid_error", "hybrid", HYBRID))
 CASE_COLOURS = {"A": "#DDDDDD", "B": "#BBCCEE", "C": "#222255", "D": "#4477AA", "E": "#225522"}
 
 
@@ -50,8 +53,9 @@ def _draw(swept: Swept, second: int | None) -> Figure:
         levels = tuple(level for level in (column, second) if level is not None)[: len(swept.config.axes)]
         runs, series = swept.chosen(swept.runs, levels), swept.chosen(swept.series, levels)
         if len(series["run"]):
-            _draw_containment(grid[0, column], series)
-            _draw_lengths(grid[1, column], series, SIZES)
+            sizes = [size for size in SIZES if size[0].removesuffix("_sqrt_area") in swept.kinds(runs)]
+            _draw_containment(grid[0, column], series, sizes)
+            _draw_lengths(grid[1, column], series, sizes)
             _draw_lengths(grid[2, column], series, ERRORS)
             _draw_cases(grid[3, column], runs)
             grid[2, column].set_xlabel("t [s]")
@@ -68,13 +72,13 @@ def _draw(swept: Swept, second: int | None) -> Figure:
         "" if second is None else f"; {', '.join(map(short, swept.telling(1)))}: {', '.join(swept.labels(1)[second])}"
     )
     figure.suptitle(swept.config.title + told, fontsize=9.5, x=0.01, ha="left", fontweight="bold")
-    _add_legend(figure)
+    _add_legend(figure, [size for size in SIZES if size[0] in swept.series])
     return figure
 
 
-def _draw_containment(axes: Axes, series: Columns) -> None:
+def _draw_containment(axes: Axes, series: Columns, sizes: Sequence[Measure]) -> None:
     t = np.unique(series["t"])
-    for name, _, colour in SIZES:
+    for name, _, colour in sizes:
         kind = name.removesuffix("_sqrt_area")
         lost, silent = series[f"{kind}_lost"] == 1, series[f"{kind}_status"] == "ok"
         held = [1 - lost[series["t"] == at].mean() for at in t]
@@ -87,7 +91,7 @@ def _draw_containment(axes: Axes, series: Columns) -> None:
     axes.grid(True)
 
 
-def _draw_lengths(axes: Axes, series: Columns, measures: tuple[tuple[str, str, str], ...]) -> None:
+def _draw_lengths(axes: Axes, series: Columns, measures: Sequence[Measure]) -> None:
     t = np.unique(series["t"])
     for name, _, colour in measures:
         of_times = [quantiles(series[name][series["t"] == at], (BAND[0], 0.5, BAND[1])) for at in t]
@@ -119,8 +123,8 @@ def _draw_cases(axes: Axes, runs: Columns) -> None:
     axes.spines[:].set_visible(False)
 
 
-def _add_legend(figure: Figure) -> None:
-    lines = [(Line2D([], [], color=colour, lw=1.8), label) for _, label, colour in SIZES + ERRORS]
+def _add_legend(figure: Figure, sizes: Sequence[Measure]) -> None:
+    lines = [(Line2D([], [], color=colour, lw=1.8), label) for _, label, colour in (*sizes, *ERRORS)]
     lines += [
         (Line2D([], [], color="0.35", lw=1.3, ls=(0, (1, 1))), "truth lost, status still ok"),
         (Patch(color="0.35", alpha=0.25, lw=0), "median and 10 % to 90 % of the robots"),

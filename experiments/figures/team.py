@@ -64,11 +64,12 @@ def _draw_snapshot(axes: Axes, results: Results, config: SceneConfig, k: int) ->
 
 
 def draw_comparison(results: Results, config: SceneConfig) -> Figure:
-    """Lengths over time, one colour per robot: both kinds of set, the filter, the hybrid."""
+    """Lengths over time, one colour per robot: each kind of set, the filter, the hybrid."""
     measures, colours = lengths(results), team_colours(config)
-    figure = Figure(figsize=(11, 3.5), layout="constrained")
-    all_axes = figure.subplots(1, len(PANELS), sharex=True, sharey=True)
-    for axes, (name, title) in zip(all_axes, PANELS, strict=True):
+    panels = [panel for panel in PANELS if panel[0] in (*config.sets, *measures)]
+    figure = Figure(figsize=(2.75 * len(panels), 3.5), layout="constrained")
+    all_axes = figure.subplots(1, len(panels), sharex=True, sharey=True)
+    for axes, (name, title) in zip(all_axes, panels, strict=True):
         main = drawing.positive(measures[name] if name in measures else measures[f"{name} sqrt_area"])
         for i, colour in enumerate(colours):
             axes.semilogy(results.t, main[:, i], color=colour, lw=1.5)
@@ -84,5 +85,5 @@ def draw_comparison(results: Results, config: SceneConfig) -> Figure:
     robots = [Line2D([], [], color=colour, lw=1.8) for colour in colours]
     looks = [Line2D([], [], color="0.4", lw=1.5), Line2D([], [], color="0.4", lw=1.0, ls=(0, (4, 1.5)))]
     labels = [*(robot.name for robot in config.robots), "√area, error", "diameter"]
-    figure.legend([*robots, *looks], labels, loc="outside lower center", ncols=len(labels))
+    figure.legend([*robots, *looks], labels, loc="outside lower center", ncols=min(len(labels), 10))
     return figure

@@ -6,7 +6,6 @@ import torch.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Annotated, Literal, Self
@@ -16,9 +15,14 @@ from pydantic import Field, model_validator
 from torchfsid.config.avoidance import AvoidanceConfig
 from torchfsid.config.barriers import BarrierConfig
 from torchfsid.config.documents import Strict, wrong
-from torchfsid.config.observers import NoiseConfig, PriorConfig, UkfConfig
+from torchfsid.config.observe import AnyNoiseConfig, Dynamics, require_one_order
+from torchfsid.config.observers import PriorConfig, UkfConfig
 from torchfsid.config.quantities import BodyName, NonNegative, Number, PlanarVector, Positive, known
 from torchfsid.config.tasks import GoalConfig
+
+SetKind = Literal["critical_region", "inverse_optimal"]
+
+SETS: tuple[SetKind, ...] = ("critical_region", "inverse_optimal")
 
 MAX_STEPS = 1_000_000
 """More is a slip of the pen in dt or duration."""
@@ -60,6 +64,7 @@ class MeasurementNoiseConfig(Strict):
     Attributes:
         velocity: bound on the length of velocity errors [m/s].
         position: bound on the length of position errors [m].
+        acceleration: bound on the length of acceleration errors, of double integrators [m/s2].
         shape: `uniform`: uniform in discs. `bias`: one error of full length per robot, constant over time.
             `adversarial`: errors of full length, chosen at every sample with knowledge of the truth and the observer
             (`experiments.runs.errors`).
@@ -67,6 +72,7 @@ class MeasurementNoiseConfig(Strict):
 
     velocity: NonNegative = 0.0
     position: NonNegative = 0.0
+    acceleration: NonNegative = 0.0
     shape: Literal["uniform", "bias", "adversarial"] = "uniform"
 
 
@@ -98,12 +104,13 @@ class ExperimentConfig(Strict):
         title: title of the figures.
         task: the task, whose goal is inferred.
         barriers: the barriers, in the order of their rows.
+        dynamics: robots that are driven by velocities, or by accelerations (`double_integrator`).
         dt: sampling time [s].
         duration: length of the run [s].
         prior: the prior set of a goal [m].
         set: the set of the plain columns, of regions.json and of the hybrid estimate. The other set is computed
-            alongside.
-        active_tolerance: distance to its boundary below which a row counts as active [m/s].
+            alongside where it can be (`sets`).
+        active_tolerance: distance to its boundary below which a row counts as active, in units of the control.
         noise: bounds on errors, for the inverse-optimal set.
         ukf: the filter.
     """
@@ -112,18 +119,25 @@ class ExperimentConfig(Strict):
     title: Text
     task: GoalConfig
     barriers: Annotated[tuple[BarrierConfig, ...], Field(min_length=1)]
+    dynamics: Dynamics = "single_integrator"
     dt: Positive
     duration: Positive
     prior: PriorConfig
-    set: Literal["critical_region", "inverse_optimal"]
+    set: SetKind
     active_tolerance: Positive = 1e-3
-    noise: NoiseConfig
+    noise: AnyNoiseConfig
     ukf: UkfConfig = UkfConfig()
 
     @property
     def steps(self) -> int:
         """The number of samples of the run."""
         return round(self.duration / self.dt)
+
+    @property
+    def sets(self) -> tuple[SetKind, ...]:
+        """The kinds of set that can be computed. The paper's needs exact rows and a nominal control without limits."""
+        exact = not self.task.is_clipped and not any(barrier.uncertain for barrier in self.barriers)
+        return SETS if exact else ("inverse_optimal",)
 
     @property
     def safety_distance(self) -> float | None:
@@ -135,13 +149,16 @@ class ExperimentConfig(Strict):
     def _can_be_simulated(self) -> Self:
         if self.task.is_unknown:
             raise wrong("expected a number, not [low, high]: robots that are simulated have it", "task.gain")
-        if self.task.needs_velocity is not None:
-            raise wrong("robots of experiments are driven by velocities", f"task.{self.task.needs_velocity}")
         for i, barrier in enumerate(self.barriers):
-            if barrier.is_second_order:
-                raise wrong("robots of experiments are driven by velocities", f"barriers[{i}]")
             if barrier.is_unknown:
                 raise wrong("expected numbers, not [low, high]: robots that are simulated have them", f"barriers[{i}]")
+        require_one_order(self.dynamics, self.task, self.barriers, self.noise)
+        if self.noise.control == "auto":
+            raise wrong(
+                "expected a number, not auto: robots that are simulated have it", f"noise.{self.noise.quantity}"
+            )
+        if self.set not in self.sets:
+            raise wrong("critical_region needs exact rows and no clipped nominal control, take inverse_optimal", "set")
         if len(self.prior.lower) != self.task.parameters:
             raise wrong(f"a goal has {self.task.parameters} entries, lower has {len(self.prior.lower)}", "prior")
         require_steps(self.duration, self.dt)
@@ -151,11 +168,6 @@ class ExperimentConfig(Strict):
         bounds = zip(self.prior.lower, goal, self.prior.upper, strict=True)
         if not all(low <= x <= high for low, x, high in bounds):
             raise wrong(f"the prior does not hold it: {list(goal)}", path)
-
-    def _require_no_radii(self, bodies: str) -> None:
-        for i, barrier in enumerate(self.barriers):
-            if barrier.uses_radius:
-                raise wrong(f"bodies of a {bodies} have no radius: give safety_distance", f"barriers[{i}].margin")
 
     def _require_in_time(self, snapshots: Sequence[float]) -> None:
         require_increasing(snapshots, "snapshots")
@@ -169,6 +181,7 @@ class SceneConfig(ExperimentConfig):
     Attributes:
         robots: the robots.
         obstacles: bodies that stand still.
+        radius: radius of all bodies, for barriers that need one [m]. Bodies are then drawn in this size.
         seed: seed of the measurement noise.
         measurement_noise: errors of the measurements.
         snapshots: times of the figure's panels [s].
@@ -178,6 +191,7 @@ class SceneConfig(ExperimentConfig):
     kind: Literal["scene"]
     robots: Annotated[tuple[RobotConfig, ...], Field(min_length=1)]
     obstacles: tuple[ObstacleConfig, ...] = ()
+    radius: Positive | None = None
     seed: WholeNumber
     measurement_noise: MeasurementNoiseConfig = MeasurementNoiseConfig()
     snapshots: Annotated[tuple[NonNegative, ...], Field(min_length=1, max_length=4)]
@@ -195,8 +209,14 @@ class SceneConfig(ExperimentConfig):
             raise wrong(f"two bodies are called {repeated[0]!r}", "robots, obstacles")
         for i, robot in enumerate(self.robots):
             self._require_in_prior(robot.goal, f"robots[{i}].goal")
-        self._require_no_radii("scene")
+        if self.radius is None and any(barrier.uses_radius for barrier in self.barriers):
+            raise wrong("expected the radius of the bodies, which a barrier needs", "radius")
         self._require_in_time(self.snapshots)
+        noise = self.measurement_noise
+        if self.dynamics == "single_integrator" and noise.acceleration > 0:
+            raise wrong("needs dynamics: double_integrator", "measurement_noise.acceleration")
+        if self.dynamics == "double_integrator" and noise.shape == "adversarial":
+            raise wrong("the adversary knows single integrators only", "measurement_noise.shape")
         if self.expected and len(self.robots) > 1:
             raise wrong("only a scene of one robot has an expected timeline", "expected")
         require_increasing([interval.until for interval in self.expected], "expected")
@@ -269,53 +289,6 @@ class CasesConfig(ExperimentConfig):
             raise wrong("expected one avoidance barrier with a margin", "barriers")
         if (barrier.distance, barrier.class_k.power, barrier.neighbour_velocity) != ("squared", 1, "none"):
             raise wrong("expected the paper's row: squared, power 1, neighbour_velocity none", "barriers[0]")
-        return self
-
-
-class SwarmConfig(ExperimentConfig):
-    """Many robots in a square, each of which avoids its nearest neighbours only. There is no filter.
-
-    Attributes:
-        robots: number of robots.
-        side: side of the square [m].
-        separation: least distance between starts [m].
-        travel: goals lie in discs of this radius around the starts, within the square [m].
-        neighbours: number of nearest neighbours that a robot avoids.
-        sensing_radius: distance within which neighbours are avoided [m].
-        seed: seed of all random numbers.
-        measurement_noise: errors of the measurements.
-        snapshots: times of the figure's panels [s].
-    """
-
-    kind: Literal["swarm"]
-    robots: Count
-    side: Positive
-    separation: NonNegative
-    travel: Positive
-    neighbours: Count
-    sensing_radius: Positive
-    seed: WholeNumber
-    measurement_noise: MeasurementNoiseConfig = MeasurementNoiseConfig()
-    snapshots: Annotated[tuple[NonNegative, ...], Field(min_length=1, max_length=4)]
-
-    @property
-    def spacing(self) -> float:
-        """The spacing of the grid from whose points starts are displaced [m]."""
-        return self.side / math.ceil(math.sqrt(self.robots))
-
-    @model_validator(mode="after")
-    def _is_a_swarm(self) -> SwarmConfig:
-        self._require_in_prior((-self.side / 2, -self.side / 2), "side")
-        self._require_in_prior((self.side / 2, self.side / 2), "side")
-        if self.separation > self.spacing:
-            raise wrong(f"no room for {self.robots} robots {self.separation} m apart", "side")
-        if self.measurement_noise.position > 0 or self.measurement_noise.shape != "uniform":
-            raise wrong("a swarm knows uniform errors of velocities only", "measurement_noise")
-        for i, barrier in enumerate(self.barriers):
-            if barrier.neighbour_velocity == "current":
-                raise wrong("no joint QP over a swarm: none or previous", f"barriers[{i}].neighbour_velocity")
-        self._require_no_radii("swarm")
-        self._require_in_time(self.snapshots)
         return self
 
 

@@ -1,4 +1,4 @@
-"""Measurements of a trajectory: positions and velocities of all robots, with errors within the declared bounds.
+"""Measurements of a trajectory: all robots' positions, velocities, accelerations, with errors within the bounds.
 
 The adversary knows the truth, the observer's model and its bounds. At every sample it tries `DIRECTIONS` errors of the
 position times `DIRECTIONS` errors of the velocity for each robot. It takes the pair whose half-spaces leave the true
@@ -36,8 +36,13 @@ def measure(true: Trajectory, config: SceneConfig) -> Trajectory:
     draw, shape = (in_disc, of_all) if noise.shape == "uniform" else (_on_circle, (robots,))
     x, u = true.x.clone(), true.u.clone()
     x[:, :robots] += draw(random, noise.position, shape)
-    u[:, :robots] += draw(random, noise.velocity, shape)
-    return replace(true, x=x, u=u)
+    if true.velocity is None:
+        u[:, :robots] += draw(random, noise.velocity, shape)
+        return replace(true, x=x, u=u)
+    velocity = true.velocity.clone()
+    velocity[:, :robots] += draw(random, noise.velocity, shape)
+    u[:, :robots] += draw(random, noise.acceleration, shape)
+    return replace(true, x=x, u=u, velocity=velocity)
 
 
 def _worst(true: Trajectory, config: SceneConfig, random: np.random.Generator) -> Trajectory:
@@ -57,8 +62,9 @@ def _worst(true: Trajectory, config: SceneConfig, random: np.random.Generator) -
         x_error, u_error = (seen[max(k - 1, 0)] - exact[max(k - 1, 0)] for seen, exact in ((x, true.x), (u, true.u)))
         before = u[k - 1] if k > 0 else torch.zeros_like(u[0])
         seen = Measurement.of_team(
-            float(true.t[k]), true.x[k] + x_error, true.u[k] + u_error, robots=range(robots), previous_u=before
-        )
+            float(true.t[k]), true.x[k] + x_error, true.u[k] + u_error,
+            robots=range(robots), previous_u=before, radius=true.radius,
+        )  # fmt: skip
         exact = true.measurement(k)
         rows = stack_barriers(barriers, exact).normalised()
         assert exact.u is not None

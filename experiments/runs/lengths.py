@@ -9,13 +9,13 @@ import math
 
 import numpy as np
 
-from experiments.runs.saved import SETS, Results
+from experiments.runs.saved import Results
 
 
 def lengths(results: Results) -> dict[str, np.ndarray]:
     """All lengths by name: (times, robots) [m]."""
     measures = {"ukf": results.error("ukf_0", "ukf_1"), "hybrid": results.error("hybrid_0", "hybrid_1")}
-    for kind in SETS:
+    for kind in results.config.sets:
         measures[f"{kind} sqrt_area"] = np.sqrt(results.of_set(kind, "volume"))
         measures[f"{kind} diameter"] = results.of_set(kind, "diameter")
         for point in ("centroid", "centre"):
@@ -30,7 +30,7 @@ def prior_lengths(results: Results) -> dict[str, np.ndarray]:
     distance = np.linalg.norm((lower + upper) / 2 - results.goals, axis=-1)
     regions = {"sqrt_area": math.sqrt(np.prod(upper - lower)), "diameter": float(np.linalg.norm(upper - lower))}
     before = {"ukf": distance, "hybrid": distance}
-    for kind in SETS:
+    for kind in results.config.sets:
         before |= {f"{kind} {name}": np.full_like(distance, length) for name, length in regions.items()}
         before |= {f"{kind} centroid": distance, f"{kind} centre": distance}
     return before

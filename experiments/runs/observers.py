@@ -1,4 +1,4 @@
-"""The observers of an experiment, on the same measurements: both kinds of set, the filter, the hybrid."""
+"""The observers of an experiment, on the same measurements: each kind of set, the filter, the hybrid."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import torch
 
 from experiments.runs.config import ExperimentConfig
 from experiments.runs.recording import Recording
-from experiments.runs.saved import SETS
 from experiments.runs.tally import SetTally, Tally
 from torchfsid.identification.evidence import SetKind
 from torchfsid.observers.hybrid import HybridEstimate, HybridObserver
@@ -50,7 +49,7 @@ class Observers:
     def __post_init__(self) -> None:
         config, recording = self.config, self.recording
         task, barriers, robots = recording.task, recording.barriers, len(recording.robots)
-        kinds = sorted(SETS, key=lambda kind: kind != config.set)
+        kinds = sorted(config.sets, key=lambda kind: kind != config.set)
         self.sets = {kind: build_sets(config, kind, task, barriers, robots) for kind in kinds}
         ukf = config.ukf.build(task, barriers, config.prior, robots, config.active_tolerance)
         self.hybrid = HybridObserver(self.sets[config.set], ukf, feedback=config.ukf.feedback)

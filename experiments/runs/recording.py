@@ -66,16 +66,19 @@ class SimulatedScene:
 
 
 def simulate_scene(config: SceneConfig) -> SimulatedScene:
-    """Run the scene's robots in closed loop, and measure them with the configured errors."""
+    """Run the scene's robots from rest in closed loop, and measure them with the configured errors."""
     task = config.task.build(config.bodies)
     barriers: list[Barrier] = [barrier.build(config.bodies) for barrier in config.barriers]
+    start = _points([robot.start for robot in config.robots])
     true = simulate(
         CbfQpController(task, barriers),
         _points([robot.goal for robot in config.robots]),
-        _points([robot.start for robot in config.robots]),
+        start,
         dt=config.dt,
         steps=config.steps,
+        velocity=torch.zeros_like(start) if config.dynamics == "double_integrator" else None,
         obstacles=_points([obstacle.position for obstacle in config.obstacles]),
+        radius=None if config.radius is None else torch.full((len(config.bodies),), config.radius, dtype=torch.float64),
     )
     return SimulatedScene(config, task, barriers, true, measure(true, config))
 

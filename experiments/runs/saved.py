@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from experiments.results import Columns, read_columns, read_json, reading, require_length
 from experiments.runs.config import CasesConfig, SceneConfig
-
-SETS: tuple[Literal["critical_region", "inverse_optimal"], ...] = ("critical_region", "inverse_optimal")
 
 
 @dataclass(frozen=True)
@@ -22,7 +21,7 @@ class Region:
 
     Attributes:
         active: names of the active rows.
-        vertices: vertices of both kinds of set [m].
+        vertices: vertices of each kind of set [m].
         rows: unit rows (a_x, a_y, b) over the control.
         u: the control [m/s].
         nominal: the nominal control [m/s].
@@ -91,7 +90,7 @@ class Results:
         """The regions by sample, then robot."""
         path, count = self.folder / "regions.jsonl", len(self.robots)
         with reading(path), path.open(encoding="utf-8") as file:
-            lines = [_region(json.loads(line)) for line in file]
+            lines = [_region(json.loads(line), self.config.sets) for line in file]
         require_length(path, len(lines), count * len(self.t))
         return [lines[i : i + count] for i in range(0, len(lines), count)]
 
@@ -118,10 +117,10 @@ class Results:
         return column.reshape(-1, len(self.robots))
 
 
-def _region(line: dict[str, Any]) -> Region:
+def _region(line: dict[str, Any], kinds: Iterable[str]) -> Region:
     return Region(
         active=[str(name) for name in line["active"]],
-        vertices={kind: np.array(line[kind], dtype=float).reshape(-1, 2) for kind in SETS},
+        vertices={kind: np.array(line[kind], dtype=float).reshape(-1, 2) for kind in kinds},
         rows=np.array(line["rows"], dtype=float).reshape(-1, 3),
         u=np.array(line["u"], dtype=float).reshape(2),
         nominal=np.array(line["nominal"], dtype=float).reshape(2),

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from experiments.kinds import Track
 from experiments.results import write_rows
 from experiments.runs.config import SceneConfig
@@ -22,17 +24,23 @@ def run_scene(config: SceneConfig, out: Path, track: Track) -> dict[str, Any]:
     write_trajectory(out / "trajectory.csv", config.bodies, scene.measured)
     observers = Observers(config, scene.recording())
     observe(observers, out, track)
-    return summarise_scene(config, Results(out, config), observers.tally, scene.true)
+    return summarise_scene(config, Results(out, config), observers, scene.true)
 
 
 def write_trajectory(path: Path, bodies: list[str], measured: Trajectory) -> None:
     """Write the measured trajectory with all digits, so that an observer of the log sees the same numbers."""
-    names = "x", "y", "vx", "vy"
+    columns, names = [measured.x], ["x", "y", "vx", "vy"]
+    if measured.velocity is not None:
+        columns, names = [*columns, measured.velocity], [*names, "ax", "ay"]
+    columns.append(measured.u)
+    if measured.radius is not None:
+        columns, names = [*columns, measured.radius.expand(measured.x.shape[:-1]).unsqueeze(-1)], [*names, "radius"]
+    numbers = torch.cat(columns, dim=-1).tolist()
     write_rows(
         path,
         (
-            {"t": t, "robot": body, **dict(zip(names, (*x[j], *u[j]), strict=True))}
-            for t, x, u in zip(measured.t.tolist(), measured.x.tolist(), measured.u.tolist(), strict=True)
-            for j, body in enumerate(bodies)
+            {"t": t, "robot": body, **dict(zip(names, of_body, strict=True))}
+            for t, of_bodies in zip(measured.t.tolist(), numbers, strict=True)
+            for body, of_body in zip(bodies, of_bodies, strict=True)
         ),
     )

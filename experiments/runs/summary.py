@@ -14,17 +14,17 @@ from torch import Tensor
 
 from experiments.runs.config import ExpectedConfig, ExperimentConfig, SceneConfig
 from experiments.runs.lengths import lengths, prior_lengths
+from experiments.runs.observers import Observers
 from experiments.runs.saved import Results
-from experiments.runs.tally import Tally
 from torchfsid.robots.simulation import Trajectory
 
 SHARES = (0.1, 0.01)
 
 
-def summarise_scene(config: SceneConfig, results: Results, tally: Tally, true: Trajectory) -> dict[str, Any]:
+def summarise_scene(config: SceneConfig, results: Results, observers: Observers, true: Trajectory) -> dict[str, Any]:
     """The content of summary.json."""
     active = {robot: [at[i].active for at in results.regions] for i, robot in enumerate(results.robots)}
-    measures, before = lengths(results), prior_lengths(results)
+    measures, before, tally = lengths(results), prior_lengths(results), observers.tally
 
     def per_robot(values: list | np.ndarray | Tensor) -> dict[str, Any]:
         return dict(zip(results.robots, values if isinstance(values, list) else values.tolist(), strict=True))
@@ -55,6 +55,7 @@ def summarise_scene(config: SceneConfig, results: Results, tally: Tally, true: T
             f"{share:.0%}": {name: per_robot(until_below(name, share)) for name in measures} for share in SHARES
         },
         "infeasible_steps": per_robot((~true.feasible).sum(0)),
+        "relaxed_samples": per_robot(observers.sets[config.set].infeasible),
         "deadlocked_since": per_robot([None if math.isnan(t) else t for t in true.deadlocked_since.tolist()]),
     }
 
@@ -66,7 +67,8 @@ def settings(config: ExperimentConfig) -> dict[str, Any]:
         "dt": config.dt,
         "set": config.set,
         "prior": config.prior.model_dump(),
-        "noise_bound": config.noise.velocity,
+        "noise_bound": config.noise.control,
+        "noise_unit": config.noise.unit,
         "ukf": {"R": config.ukf.position_noise**2, "Q_per_second": config.ukf.process_noise**2, "prior_std": spread},
     }
 

@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from rich.console import Console
 
-from experiments.runs.config import CasesConfig
+from experiments.runs.config import SETS, CasesConfig
 from experiments.runs.observers import Observers
-from experiments.runs.saved import SETS, Results
+from experiments.runs.saved import Results
 from experiments.runs.summary import settings
 from experiments.tables import table
 from torchfsid.config.quantities import known

@@ -50,7 +50,7 @@ class SetTally:
 
 @dataclass
 class Tally:
-    """Counts of a run for both kinds of set, and how much the motions depended on the parameter.
+    """Counts of a run for each kind of set, and how much the motions depended on the parameter.
 
     Attributes:
         goals: true goals [m].

@@ -16,10 +16,16 @@ ESTIMATORS = {"ukf": "UKF error", "hybrid": "hybrid error"} | {
 }
 
 
+LONGEST = 10
+"""Intervals of a timeline that are printed."""
+
+
 def print_verdict(summary: dict[str, Any], console: Console) -> None:
     """Print the summary of a scene."""
     for robot, intervals in summary["timeline"].items():
-        console.print(escape(f"{robot}: " + "; ".join(map(_interval, intervals))), highlight=False)
+        more = [f"{len(intervals) - LONGEST} more in summary.json"] if len(intervals) > LONGEST else []
+        told = "; ".join([*map(_interval, intervals[:LONGEST]), *more])
+        console.print(escape(f"{robot}: {told}"), highlight=False)
     if "expected_timeline" in summary:
         console.print(f"Farthest from the expected timeline: {summary['expected_timeline']['deviation']:.3g} s")
     console.print(f"{summary['steps']} steps per robot, of which")
@@ -29,12 +35,16 @@ def print_verdict(summary: dict[str, Any], console: Console) -> None:
     console.print("From when on lengths are below 10 % / 1 % of the prior's \\[s]:")
     robots = list(summary["timeline"])
     shown = table([""], [escape(robot) for robot in robots])
-    for name, label in ESTIMATORS.items():
+    for name, label in ((name, ESTIMATORS[name]) for name in ESTIMATORS if name in summary["before"]):
         of_shares = [summary["time_below"][share][name] for share in ("10%", "1%")]
         shown.add_row(label, *(" / ".join(_time(of[robot]) for of in of_shares) for robot in robots))
+    relaxed = summary["relaxed_samples"]
+    if any(relaxed.values()):
+        shown.add_section()
+        shown.add_row("samples whose rows may be relaxed", *(str(relaxed[robot]) for robot in robots))
     console.print(shown)
     for robot in robots:
-        if summary["infeasible_steps"][robot]:
+        if summary["infeasible_steps"][robot] and not relaxed[robot]:
             console.print(
                 f"[red]{escape(robot)}: {summary['infeasible_steps'][robot]} steps without a feasible control"
             )

@@ -17,7 +17,6 @@ from experiments.results import rows_of
 from experiments.runs.config import SceneConfig
 from experiments.runs.observers import Observers
 from experiments.runs.recording import SimulatedScene, simulate_scene
-from experiments.runs.saved import SETS
 from torchfsid.commands.results import STATUS_NAMES
 from torchfsid.identification.active_set import active_set
 from torchfsid.identification.kkt import CASES, solve_kkt
@@ -43,7 +42,7 @@ def observed(scene: SceneConfig, times: tuple[float, ...]) -> dict[str, Any]:
     simulated = simulate_scene(scene)
     recording = simulated.recording()
     observers = Observers(scene, recording)
-    lost_since = {kind: torch.full((len(recording.robots),), math.nan, dtype=torch.float64) for kind in SETS}
+    lost_since = {kind: torch.full((len(recording.robots),), math.nan, dtype=torch.float64) for kind in scene.sets}
     kept = {round(t / scene.dt) for t in times}
     cases = torch.zeros(len(CASES))
     seen_right, series, sizes = 0, [], {}
@@ -66,12 +65,13 @@ def observed(scene: SceneConfig, times: tuple[float, ...]) -> dict[str, Any]:
         "robots": len(recording.robots),
         "obstacles": len(scene.obstacles),
         "infeasible_steps": int((~simulated.true.feasible).sum()),
+        "relaxed_samples": int(observers.sets[scene.set].infeasible.sum()),
         "deadlocked": len(stopped),
         "deadlocked_since": min(stopped, default=None),
         **{f"case_{letter}": round(share, 6) for letter, share in zip(CASES, shares, strict=True)},
         "active_set_seen": round(seen_right / float(cases.sum()), 6),
     }
-    for kind in SETS:
+    for kind in scene.sets:
         row |= {f"{kind}_{name}": value for name, value in _of_set(observers, kind, lost_since[kind]).items()}
     row |= {name: _rounded(float(values.nanmedian())) for name, values in sizes.items()}
     return {"row": row, "series": series, "seconds": round(time.perf_counter() - began, 3)}
@@ -92,11 +92,11 @@ def _control(measurement: Measurement) -> Tensor:
 def _sizes(estimate: HybridEstimate, sets: dict[str, SetEstimate], goals: Tensor) -> dict[str, Tensor]:
     """Sizes and errors of every robot, by name [m]."""
     sizes = {}
-    for kind in SETS:
-        theta = sets[kind].feasible_set
+    for kind, of_kind in sets.items():
+        theta = of_kind.feasible_set
         sizes[f"{kind}_sqrt_area"] = theta.volume().sqrt()
         sizes[f"{kind}_diameter"] = theta.diameter()
-        sizes[f"{kind}_centroid_error"] = (sets[kind].theta - goals).norm(dim=-1)
+        sizes[f"{kind}_centroid_error"] = (of_kind.theta - goals).norm(dim=-1)
     sizes["ukf_error"] = (estimate.ukf_estimate.theta - goals).norm(dim=-1)
     sizes["hybrid_error"] = (estimate.theta - goals).norm(dim=-1)
     return sizes
@@ -106,9 +106,9 @@ def _series(
     t: float, robots: list[str], sizes: dict[str, Tensor], sets: dict[str, SetEstimate], observers: Observers
 ) -> list[dict[str, Any]]:
     columns: dict[str, list] = {"t": [_rounded(t)] * len(robots), "robot": robots}
-    for kind in SETS:
+    for kind, of_kind in sets.items():
         columns[f"{kind}_lost"] = (observers.tally.sets[kind].outside > 0).long().tolist()
-        columns[f"{kind}_status"] = [STATUS_NAMES[of_robot] for of_robot in sets[kind].status.tolist()]
+        columns[f"{kind}_status"] = [STATUS_NAMES[of_robot] for of_robot in of_kind.status.tolist()]
     columns |= {name: [_rounded(value) for value in values.tolist()] for name, values in sizes.items()}
     return rows_of(columns)
 

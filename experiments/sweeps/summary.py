@@ -10,7 +10,6 @@ import numpy as np
 from rich.console import Console
 
 from experiments.figures.style import length
-from experiments.runs.saved import SETS
 from experiments.sweeps.config import SweepConfig
 from experiments.sweeps.swept import Swept, quantiles, short
 from experiments.tables import table
@@ -42,11 +41,12 @@ def _point(swept: Swept, at: tuple[int, ...]) -> dict[str, Any]:
         "runs": len(runs["run"]),
         "robots": robots,
         "infeasible_steps": int(runs["infeasible_steps"].sum()),
+        "relaxed_samples": int(runs["relaxed_samples"].sum()),
         "deadlocked": int(runs["deadlocked"].sum()),
         "cases": {letter: _mean(runs[f"case_{letter}"], runs["robots"]) for letter in "ABCDE"},
         "active_set_seen": _mean(runs["active_set_seen"], runs["robots"]),
     }
-    for kind in SETS:
+    for kind in swept.kinds(runs):
         lost = runs[f"{kind}_lost"]
         counts = {name: int(runs[f"{kind}_{name}"].sum()) for name in COUNTS}
         found[kind] = {"runs_lost": int((lost > 0).sum()), "lost": int(lost.sum()), **counts}
@@ -69,9 +69,11 @@ def print_sweep(summary: dict[str, Any], console: Console) -> None:
     texts, numbers = ([heading.replace(" ", "\n") for heading in of] for of in (summary["keys"], numbers))
     shown = table(texts, numbers)
     for point in summary["points"]:
-        paper, ours = (point[kind] for kind in SETS)
-        counts = point["runs"], point["robots"], paper["lost"], paper["lost_in_silence"]
-        cells = [*map(str, counts), _median(paper["sqrt_area"]), str(ours["lost"]), _median(ours["sqrt_area"])]
+        paper, ours = point.get("critical_region"), point["inverse_optimal"]
+        cells = [str(point["runs"]), str(point["robots"]), "", "", ""]
+        if paper is not None:
+            cells[2:] = str(paper["lost"]), str(paper["lost_in_silence"]), _median(paper["sqrt_area"])
+        cells += str(ours["lost"]), _median(ours["sqrt_area"])
         shown.add_row(*point["point"], *cells, _median(point["ukf_error"]), _median(point["hybrid_error"]))
     console.print(shown)
     if summary["failed"]:

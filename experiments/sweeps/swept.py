@@ -12,6 +12,7 @@ import numpy as np
 
 from experiments.figures.style import length
 from experiments.results import Columns, reading
+from experiments.runs.config import SETS, SetKind
 from experiments.sweeps.config import SweepConfig
 from experiments.sweeps.tables import read_table
 from torchfsid.errors import FigureError
@@ -64,6 +65,11 @@ class Swept:
             point = self.point_of[table["run"].astype(int)]
         return table.rows((point[:, : len(levels)] == levels).all(-1))
 
+    @staticmethod
+    def kinds(runs: Columns) -> list[SetKind]:
+        """The kinds of set that these rows of `runs` have."""
+        return [kind for kind in SETS if f"{kind}_lost" in runs and np.isfinite(runs[f"{kind}_lost"]).all()]
+
     def telling(self, axis: int) -> list[str]:
         """The first keys of an axis, as many as distinguish its entries."""
         levels = self.config.axes[axis]
@@ -95,4 +101,6 @@ def _value(key: str, value: Any) -> str:
         return str(value)
     if key.endswith("velocity"):
         return f"{length(value)}/s"
+    if key.endswith("acceleration"):
+        return f"{length(value)}/s2"
     return length(value) if key.endswith("position") else f"{value:g}"

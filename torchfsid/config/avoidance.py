@@ -70,6 +70,7 @@ class _KeepsDistance(Strict):
     safety_distances: dict[BodyName, Positive] = Field(default_factory=dict)
     margin: NonNegativeOrInterval | None = None
     soft: Flag = False
+    uncertain: ClassVar[bool] = False
 
     @model_validator(mode="after")
     def _one_distance(self) -> _KeepsDistance:

@@ -1,6 +1,7 @@
 """The barriers in configuration files. Each builds an object of `robots`.
 
-Each barrier says what it needs from a log: the bodies' radii, and their velocities now or one sample earlier.
+Each barrier says what it needs from a log: the bodies' radii, and their velocities now or one sample earlier. It also
+says whether its rows are uncertain even if all but the controls is exact (`Barrier.uncertain`).
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ class _RobotsOwn(Strict):
 
     is_unknown: ClassVar[bool] = False
     is_second_order: ClassVar[bool] = False
+    uncertain: ClassVar[bool] = False
 
     @property
     def uses_radius(self) -> bool:
@@ -109,6 +111,7 @@ class SpeedDiscConfig(_RobotsOwn):
     kind: Literal["speed_disc"] = "speed_disc"
     limit: Positive
     soft: Flag = False
+    uncertain: ClassVar[bool] = True
 
     def build(self, bodies: Sequence[str]) -> Barrier:
         """The barrier. It does not depend on the bodies."""
@@ -145,6 +148,7 @@ class OrcaConfig(Strict):
     push_away: NonNegative = 0.0
     is_unknown: ClassVar[bool] = False
     is_second_order: ClassVar[bool] = False
+    uncertain: ClassVar[bool] = True
 
     @property
     def uses_radius(self) -> bool:

@@ -51,6 +51,9 @@ OptionalUkfConfig = Annotated[
 """`ukf: false` leaves the filter out, and with it the hybrid."""
 
 
+Dynamics = Literal["single_integrator", "double_integrator"]
+
+
 class ObserveConfig(Strict):
     """The file of `torchfsid observe`: the declared model, the prior and the bounds on errors.
 
@@ -78,7 +81,7 @@ class ObserveConfig(Strict):
     noise: AnyNoiseConfig
     set: Literal["inverse_optimal", "critical_region"] = "inverse_optimal"
     active_tolerance: Positive = 1e-3
-    dynamics: Literal["single_integrator", "double_integrator"] = "single_integrator"
+    dynamics: Dynamics = "single_integrator"
     velocity: Literal["logged", "differentiated"] = "logged"
     obstacles: tuple[BodyName, ...] = ()
     on_inconsistent: Literal["hold", "reset", "raise"] = "hold"
@@ -90,7 +93,7 @@ class ObserveConfig(Strict):
         expected, got = self.task.parameters, len(self.prior.lower)
         if got != expected:
             raise wrong(f"task '{self.task.kind}' has {expected} parameters, lower and upper have {got}", "prior")
-        self._require_one_order()
+        require_one_order(self.dynamics, self.task, self.barriers, self.noise)
         unknown = [i for i, barrier in enumerate(self.barriers) if barrier.is_unknown]
         if len(unknown) > 1:
             raise wrong("one barrier may have unknown parameters, and another one has", f"barriers[{unknown[1]}]")
@@ -98,6 +101,8 @@ class ObserveConfig(Strict):
             raise wrong("critical_region needs known safety parameters, take inverse_optimal", "set")
         if self.set == "critical_region" and self.task.is_clipped:
             raise wrong("critical_region knows no saturation or dead zone, take inverse_optimal", "set")
+        if self.set == "critical_region" and any(barrier.uncertain for barrier in self.barriers):
+            raise wrong("critical_region needs rows that are known exactly, take inverse_optimal", "set")
         if self.task.is_unknown and self.set == "critical_region":
             raise wrong("critical_region needs a known gain, take inverse_optimal", "set")
         if self.task.is_unknown and self.on_inconsistent == "reset":
@@ -107,25 +112,6 @@ class ObserveConfig(Strict):
         if self.noise.control == "auto" and self.on_inconsistent == "reset":
             raise wrong("auto takes a change of goal for noise, give a number or take on_inconsistent: hold", "noise")
         return self
-
-    def _require_one_order(self) -> None:
-        """Check that task, barriers and noise are those of robots with these dynamics."""
-        second, dynamics = self.is_second_order, f"dynamics: {self.dynamics}"
-        if second and self.task.kind != "goal":
-            raise wrong(f"expected 'goal' with {dynamics}, got {self.task.kind!r}", "task.kind")
-        if second and getattr(self.task, "law", "proportional") != "proportional":
-            raise wrong(f"expected 'proportional' with {dynamics}", "task.law")
-        if not second and self.task.needs_velocity is not None:
-            raise wrong("needs dynamics: double_integrator", f"task.{self.task.needs_velocity}")
-        for i, barrier in enumerate(self.barriers):
-            if barrier.kind == "avoidance" and barrier.is_second_order != second:
-                raise wrong(f"expected {1 + second} with {dynamics}, got {2 - second}", f"barriers[{i}].order")
-            if barrier.is_second_order != second:
-                limits = "rows over accelerations, such as acceleration_box," if second else "rows over velocities"
-                raise wrong(f"expected {limits} with {dynamics}, got {barrier.kind!r}", f"barriers[{i}].kind")
-        needed = "acceleration" if second else "velocity"
-        if self.noise.quantity != needed:
-            raise wrong(f"expected a bound on {needed} with {dynamics}", f"noise.{needed}")
 
     @property
     def is_second_order(self) -> bool:
@@ -203,3 +189,25 @@ class ObserveConfig(Strict):
             return sets
         ukf = self.ukf.build(task, known, self.prior, robots, self.active_tolerance)
         return HybridObserver(sets, ukf, feedback=self.ukf.feedback)
+
+
+def require_one_order(
+    dynamics: Dynamics, task: TaskConfig, barriers: Sequence[BarrierConfig], noise: AnyNoiseConfig
+) -> None:
+    """Check, in a validator, that task, barriers and noise are those of robots with these dynamics."""
+    second, declared = dynamics == "double_integrator", f"dynamics: {dynamics}"
+    if second and task.kind != "goal":
+        raise wrong(f"expected 'goal' with {declared}, got {task.kind!r}", "task.kind")
+    if second and getattr(task, "law", "proportional") != "proportional":
+        raise wrong(f"expected 'proportional' with {declared}", "task.law")
+    if not second and task.needs_velocity is not None:
+        raise wrong("needs dynamics: double_integrator", f"task.{task.needs_velocity}")
+    for i, barrier in enumerate(barriers):
+        if barrier.kind == "avoidance" and barrier.is_second_order != second:
+            raise wrong(f"expected {1 + second} with {declared}, got {2 - second}", f"barriers[{i}].order")
+        if barrier.is_second_order != second:
+            limits = "rows over accelerations, such as acceleration_box," if second else "rows over velocities"
+            raise wrong(f"expected {limits} with {declared}, got {barrier.kind!r}", f"barriers[{i}].kind")
+    needed = "acceleration" if second else "velocity"
+    if noise.quantity != needed:
+        raise wrong(f"expected a bound on {needed} with {declared}", f"noise.{needed}")
