@@ -123,7 +123,7 @@ def check_batch(barrier: Barrier, situations: Measurement, seed: int = 0) -> Non
     draw = generator(seed)
     seen, noise = measured(situations, SIZES[1], draw)
     far = 5 * uniform(seen.x[..., 0], draw)
-    seen = replace(seen, left_out=LeftOut(far, far / 5, far / 50))
+    seen = replace(seen, left_out=LeftOut(far, far / 5, far / 50, far / 5))
     order = torch.randperm(len(far), generator=draw).to(far.device)
     for k in range(min(8, len(far))):
         _same("check_batch", barrier, seen.select(order[k : k + 1]), seen, noise, "a robot is alone", order[k : k + 1])
