@@ -190,13 +190,14 @@ def check_left_out(barrier: Barrier, situations: Measurement, seed: int = 0) -> 
         "present": torch.ones_like(true.present[:, 0]),
         "body_velocities": toward * speed.unsqueeze(-1) * (1 - slower),
         "previous_body_velocities": toward * speed.unsqueeze(-1) * (1 - slower),
+        "body_accelerations": toward * speed.unsqueeze(-1) * (1 - slower),
         "body_radii": radius,
     }
     whole = of_tensors(true, lambda name, value: first(value, body[name]) if name in body else value)
     whole = replace(whole, u=u * 2 * own_speed.unsqueeze(-1))
     without = replace(whole, present=first(whole.present, ~whole.present[:, 0]))
     rows, others = barrier(whole), barrier(without)
-    told = barrier.slack_left_out(replace(without, left_out=LeftOut(distance, speed, radius)))  # type: ignore[attr-defined]
+    told = barrier.slack_left_out(replace(without, left_out=LeftOut(distance, speed, radius, speed)))  # type: ignore[attr-defined]
     added = (rows.A != 0).any(-1) & ((rows.A != others.A).any(-1) | (rows.b != others.b))
     least = rows.slack(_control(whole)).masked_fill(~added, math.inf).amin(-1, keepdim=True)
     _at_most(told.unsqueeze(-1), least + CLOSE, "check_left_out: `slack_left_out` is more than the row's slack [m/s]")
