@@ -221,6 +221,7 @@ def _of_teams(
         present=(slot != slot[:robots, None]).expand(*teams, robots, bodies),
         body_velocities=None if u is None else among(u),
         previous_body_velocities=among(previous_u),
+        velocity=previous_u[..., :robots, :],
         radius=None if radius is None else radius[..., :robots],
         body_radii=None if radius is None else among(radius),
     )
