@@ -1,8 +1,8 @@
 """What an observer reports when the controller is of another kind, or ORCA's horizon or radii are wrong.
 
-`python -m experiments.studies.wrong_controllers` prints the tables of docs/wrong_models.md. Random teams cross, driven
-by ORCA or by barrier rows, and are measured exactly. A robot interacts if a row ever holds it back, by more than the
-declared bound. Only these robots can show that rows are wrong.
+`python -m experiments.studies.wrong_controllers` prints a table of docs/wrong_models.md. Random teams cross, driven by
+ORCA or by barrier rows, and are measured exactly. A robot interacts if a row ever holds it back from its nominal
+control by more than the declared bound. Only these robots can show that rows are wrong.
 """
 
 from __future__ import annotations
@@ -75,7 +75,8 @@ def radii(factor: float) -> Callable[[Measurement], Measurement]:
     """Take the radii to be wrong by this factor."""
 
     def seen(sample: Measurement) -> Measurement:
-        assert sample.radius is not None and sample.body_radii is not None
+        assert sample.radius is not None
+        assert sample.body_radii is not None
         return replace(sample, radius=factor * sample.radius, body_radii=factor * sample.body_radii)
 
     return seen
@@ -177,6 +178,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--auto", action="store_true", help="judge the bound that velocity: auto would take, too")
     chosen = parser.parse_args(arguments)
     torch.set_num_threads(1)
+    teams: dict[Barrier, list[Team]]
     teams = {barrier: [simulated(barrier, seed) for seed in range(chosen.teams)] for barrier in (ORCA, CBF)}
     heads = ("model", "robots", "interact", "flagged of them", "flagged of others", "ok, outside", "relaxed", "unused")
     heads = (*heads, "diameter") + (("auto: useless or none", "share") if chosen.auto else ())
@@ -201,8 +203,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ]
         if chosen.auto:
             found = [judged(belief, team) for team in of_run]
-            shares = sorted(bound.share for bound in found)
-            cells += [f"{sum(bound.is_useless for bound in found)} of {len(found)}", f"{shares[0]:.2g}-{shares[-1]:.2g}"]
+            least, most = (pick(bound.share for bound in found) for pick in (min, max))
+            cells += [f"{sum(bound.is_useless for bound in found)} of {len(found)}", f"{least:.2g}-{most:.2g}"]
         print(f"| {' | '.join(cells)} |", flush=True)
     return 0
 
