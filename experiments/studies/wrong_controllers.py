@@ -1,0 +1,213 @@
+"""What an observer reports when the controller is of another kind, or ORCA's horizon or radii are wrong.
+
+`python -m experiments.studies.wrong_controllers` prints a table of docs/wrong_models.md. Random teams cross, driven by
+ORCA or by barrier rows, and are measured exactly. A robot interacts if a row ever holds it back from its nominal
+control by more than the declared bound. Only these robots can show that rows are wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchfsid.commands.declared_log import AUTO_FACTOR
+from torchfsid.commands.judged_bound import JudgedBound
+from torchfsid.observers.consistency import Consistency
+from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.outcome import Status
+from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
+from torchfsid.robots.barriers import Barrier
+from torchfsid.robots.bounds import NoiseBound
+from torchfsid.robots.controller import CbfQpController
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.orca import Orca
+from torchfsid.robots.simulation import Trajectory, simulate
+from torchfsid.robots.tasks import GoalTask, Saturation
+from torchfsid.sets.feasible_set import FeasibleSet
+
+DT, STEPS, GAIN, BOUND = 0.1, 160, 0.7, 1e-5
+ROBOTS = (8, 20)
+"""A team has from this to that many robots."""
+
+TASK = GoalTask(GAIN, saturation=Saturation("norm", (1.0, 1.0)))
+ORCA = Orca(time_horizon=2.0, time_step=DT, max_speed=1.3, count=8, distance=6.0)
+CBF = CollisionAvoidance(ClassK(2.0), margin=0.05)
+
+
+@dataclass(frozen=True)
+class Team:
+    """A run, the goals [m] and the robots that interact."""
+
+    run: Trajectory
+    goals: Tensor
+
+    @property
+    def interacts(self) -> Tensor:
+        """The robots that a row holds back from their nominal controls."""
+        run = self.run
+        held = (run.u - run.nominal).norm(dim=-1) > BOUND
+        return (held & run.active.any(-1)).any(0)
+
+    @property
+    def gets_free(self) -> Tensor:
+        """The robots that are free at some time, with a nominal control that is not clipped."""
+        run, limits = self.run, TASK.saturation
+        assert limits is not None
+        slow = run.nominal.norm(dim=-1) < 0.99 * limits.limits[0]
+        return (slow & ((run.u - run.nominal).norm(dim=-1) < 1e-9) & ~run.active.any(-1)).any(0)
+
+    @property
+    def prior(self) -> FeasibleSet:
+        reach = torch.full_like(self.goals, 10.0)
+        return FeasibleSet.from_box(-reach, reach)
+
+
+def as_it_is(sample: Measurement) -> Measurement:
+    return sample
+
+
+def radii(factor: float) -> Callable[[Measurement], Measurement]:
+    """Take the radii to be wrong by this factor."""
+
+    def seen(sample: Measurement) -> Measurement:
+        assert sample.radius is not None
+        assert sample.body_radii is not None
+        return replace(sample, radius=factor * sample.radius, body_radii=factor * sample.body_radii)
+
+    return seen
+
+
+def too_late(sample: Measurement) -> Measurement:
+    """Take the velocities of the sample itself for those before it."""
+    return replace(sample, velocity=sample.u, previous_body_velocities=sample.body_velocities)
+
+
+@dataclass(frozen=True)
+class Belief:
+    """The barrier that an observer assumes, and the barrier that the robots have."""
+
+    name: str
+    barrier: Barrier
+    run: Barrier = ORCA
+    seen: Callable[[Measurement], Measurement] = as_it_is
+
+
+BELIEFS = (
+    Belief("ORCA: right model", ORCA),
+    Belief("ORCA: time horizon + 20 %", replace(ORCA, time_horizon=1.2 * ORCA.time_horizon)),
+    Belief("ORCA: time horizon - 20 %", replace(ORCA, time_horizon=0.8 * ORCA.time_horizon)),
+    Belief("ORCA: radii + 20 %", ORCA, seen=radii(1.2)),
+    Belief("ORCA: radii - 20 %", ORCA, seen=radii(0.8)),
+    Belief("ORCA: velocities of the same sample", ORCA, seen=too_late),
+    Belief("ORCA: barrier rows assumed", CBF),
+    Belief("ORCA: joint barrier rows assumed", replace(CBF, neighbour_velocity="current")),
+    Belief("barrier rows: right model", CBF, CBF),
+    Belief("barrier rows: ORCA assumed", ORCA, CBF),
+)
+
+
+def simulated(barrier: Barrier, seed: int) -> Team:
+    """A team that crosses: from a ring to the other side, or to a random place on it."""
+    generator = torch.Generator().manual_seed(seed)
+    robots = int(torch.randint(ROBOTS[0], ROBOTS[1] + 1, (), generator=generator))
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    turn = 2 * math.pi * (torch.arange(robots) + 0.4 * uniform(robots)) / robots
+    start = max(2.5, 0.22 * robots) * torch.stack([turn.cos(), turn.sin()], dim=-1)
+    other = start if seed % 2 else -start[torch.randperm(robots, generator=generator)]
+    goals = -other + 0.4 * (uniform(robots, 2) - 0.5)
+    radius = 0.15 + 0.15 * uniform(robots)
+    run = simulate(CbfQpController(TASK, [barrier]), goals, start, dt=DT, steps=STEPS, radius=radius)
+    return Team(run, goals)
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How the robots of one team end.
+
+    Attributes:
+        flagged: whether the status is not `ok`.
+        inside: whether the truth is in the set.
+        diameter: of the final sets, relative to 2 BOUND/GAIN.
+        relaxed: share of the samples that are not used because the rows may have been infeasible.
+        unused: share of the samples that are not used.
+    """
+
+    flagged: Tensor
+    inside: Tensor
+    diameter: Tensor
+    relaxed: float
+    unused: float
+
+
+def ending(belief: Belief, team: Team) -> Ending:
+    """Observe a team with the barrier of the belief."""
+    observer = SetMembershipObserver(TASK, [belief.barrier], team.prior, noise=NoiseBound(BOUND))
+    relaxed = 0
+    for sample in team.run.measurements():
+        relaxed += int(observer.update(belief.seen(sample)).evidence.infeasible.sum())
+    samples = len(team.run.t) * len(team.goals)
+    return Ending(
+        observer.status != Status.OK,
+        observer.feasible_set.contains(team.goals),
+        observer.feasible_set.diameter() / (2 * BOUND / GAIN),
+        relaxed / samples,
+        int(observer.skipped.sum()) / samples,
+    )
+
+
+def judged(belief: Belief, team: Team) -> JudgedBound:
+    """The bound that `velocity: auto` takes for a team. It is infinite if none explains all of its robots."""
+    samples = [belief.seen(sample) for sample in team.run.measurements()]
+    consistency = Consistency(samples, TASK, [belief.barrier], team.prior)
+    bound = AUTO_FACTOR * float(consistency.smallest_bounds(consistency.fastest).max())
+    return JudgedBound.of(bound, team.run.u.norm(dim=-1).flatten().numpy())
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the study and print its table."""
+    parser = argparse.ArgumentParser(prog="python -m experiments.studies.wrong_controllers")
+    parser.add_argument("--teams", type=int, default=12, help="teams of each kind")
+    parser.add_argument("--auto", action="store_true", help="judge the bound that velocity: auto would take, too")
+    chosen = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    teams: dict[Barrier, list[Team]]
+    teams = {barrier: [simulated(barrier, seed) for seed in range(chosen.teams)] for barrier in (ORCA, CBF)}
+    heads = ("model", "robots", "interact", "flagged of them", "flagged of others", "ok, outside", "relaxed", "unused")
+    heads = (*heads, "diameter") + (("auto: useless or none", "share") if chosen.auto else ())
+    print(f"| {' | '.join(heads)} |\n|{'---|' * len(heads)}")
+    for belief in BELIEFS:
+        of_run = teams[belief.run]
+        ends = [ending(belief, team) for team in of_run]
+        interacts = torch.cat([team.interacts for team in of_run])
+        flagged, inside = torch.cat([end.flagged for end in ends]), torch.cat([end.inside for end in ends])
+        free = torch.cat([team.gets_free for team in of_run]) & ~flagged
+        widths = torch.cat([end.diameter for end in ends])[free]
+        cells = [
+            belief.name,
+            f"{len(flagged)}",
+            f"{int(interacts.sum())}",
+            f"{int((flagged & interacts).sum())}",
+            f"{int((flagged & ~interacts).sum())}",
+            f"{int((~flagged & ~inside).sum())}",
+            f"{sum(end.relaxed for end in ends) / len(ends):.1%}",
+            f"{sum(end.unused for end in ends) / len(ends):.1%}",
+            f"{float(widths.median()):.3g}, {float(widths.max()):.3g}" if len(widths) else "",
+        ]
+        if chosen.auto:
+            found = [judged(belief, team) for team in of_run]
+            least, most = (pick(bound.share for bound in found) for pick in (min, max))
+            cells += [f"{sum(bound.is_useless for bound in found)} of {len(found)}", f"{least:.2g}-{most:.2g}"]
+        print(f"| {' | '.join(cells)} |", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
