@@ -1,5 +1,6 @@
 """ORCA: rows and controls against RVO2, the QP in a disc against its conditions, and truths that stay inside."""
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -213,6 +214,23 @@ def test_a_violated_row_that_nothing_explains_is_an_alarm() -> None:
         found = evidence(ObservationModel(VelocityTask(), [orca], noise=NoiseBound(1e-5)), box, seen, compiled)
         assert found.alarmed.all()
         assert not found.infeasible.any()
+
+
+def test_single_precision_between_nearly_opposite_rows_is_no_alarm() -> None:
+    """Between two bodies RVO2 stops up to 3e-4 m/s short of its speed limit, where the least violation is."""
+    orca = Orca(2.0, 0.1, 1.5, 5, 10.0)
+    x = torch.tensor([[0.0, 0.0], [0.55, 0.003], [-0.55, 0.0]], dtype=torch.float64)
+    v = torch.zeros_like(x)
+    seen = Measurement.of_team(0.0, x, previous_u=v, radius=torch.full((3,), 0.3, dtype=torch.float64), robots=[0])
+    exact = CbfQpController(VelocityTask(), [orca])(seen, torch.tensor([[0.0, 1.0]]).double())
+    assert not exact.feasible.any()
+    assert float(exact.u.norm()) == pytest.approx(1.5)
+    box = FeasibleSet.from_box(torch.full((1, 2), -3.0).double(), torch.full((1, 2), 3.0).double())
+    for compiled, share in itertools.product((True, False), (1.0, 1 - 2e-4)):
+        model = ObservationModel(VelocityTask(), [orca], noise=NoiseBound(1e-5))
+        found = evidence(model, box, replace(seen, u=share * exact.u), compiled)
+        assert found.infeasible.all()
+        assert not found.alarmed.any()
 
 
 def test_bodies_without_a_slot_are_no_neighbours_behind_nearer_ones() -> None:

@@ -26,6 +26,11 @@ RANK_TOLERANCE = 1e-7
 ANGLE_TOLERANCE = 1e-12
 """Round-off allowed when an angular gap is compared with 180 degrees [rad]."""
 
+RELAXED_OPENING = 0.5
+"""A violation of relaxed rows is an alarm only if they could all be violated less, and the directions for that open by
+more than this [rad]. Where two rows are nearly opposite, controllers in single precision miss the least violation:
+along them by 2e-7 |u| / opening^2, and RVO2 by any amount where they are parallel up to 1e-5."""
+
 ACTIVE_TOLERANCE = 1e-3
 """Default distance to a row's boundary below which the row counts as active [m/s]."""
 

@@ -13,7 +13,8 @@ A sample is informative only if
 
 A controller that relaxes infeasible rows takes a control at which rows with the largest violation, the speed limit
 among them, hold each other: some positive combination of them is zero. So the sample says nothing of theta if the cone
-of the rows that may be active contains a line. If it contains none, no row of such a barrier may be violated.
+of the rows that may be active contains a line. If it contains none, no row of such a barrier may be violated. Since
+controllers are not exact where it nearly contains one, a violation is then no alarm, either (`RELAXED_OPENING`).
 
 The measurements of a whole log can be concatenated into one batch. In the plane, where no gradient is needed, compiled
 code computes the same from the slacks on (`kernels.evidence`).
@@ -44,7 +45,7 @@ from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.neighbours import left_out_inactive, within_bounds
 from torchfsid.robots.tasks import Task, feedback_of
 from torchfsid.sets.feasible_set import FeasibleSet
-from torchfsid.tolerances import ACTIVE_TOLERANCE, ROUND_OFF
+from torchfsid.tolerances import ACTIVE_TOLERANCE, RELAXED_OPENING, ROUND_OFF
 
 NO_CLIP = (np.empty(0), False, 0.0, np.empty((0, 0, 2)))
 """`clip` of `kernels.evidence` for nominal controls that are not clipped."""
@@ -294,8 +295,9 @@ def _in_torch(model: ObservationModel, sample: _Sample) -> Evidence:
     alarmed, infeasible = usable & ((excess > 0) & sample.hard).any(-1), torch.zeros_like(usable)
     outward = None if model.kind == "critical_region" else normals_of(unit, near, sample.row_errors)
     if outward is not None and bool(sample.relaxed.any()):
-        alarmed = alarmed | usable & outward.pointed & ((excess > 0) & sample.relaxed).any(-1)
-        infeasible = usable & ~alarmed & ~outward.pointed
+        strained = ((excess > 0) & sample.relaxed).any(-1)
+        alarmed = alarmed | usable & strained & (outward.opening > RELAXED_OPENING)
+        infeasible = usable & ~alarmed & (strained | (outward.opening == 0))
     informative = usable & ~alarmed & ~infeasible
     if sample.row_errors is not None:
         informative = informative & ~(near & without_direction(unit, sample.row_errors)).any(-1)

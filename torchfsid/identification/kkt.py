@@ -177,12 +177,13 @@ class OutwardNormals(NamedTuple):
     Attributes:
         normals: unit vectors, zero where not needed.
         generator: the generator nearest to each; m for none.
-        pointed: whether the cone contains no line, so that no positive combination of its generators is zero.
+        opening: by how much the widest angle without generators exceeds 180 degrees [rad]; 2 pi without generators. If
+            it is positive, the cone contains no line: no positive combination of its generators is zero. Else it is 0.
     """
 
     normals: Float[Tensor, "*batch k 2"]
     generator: Int[Tensor, "*batch k"]
-    pointed: Bool[Tensor, "*batch"]
+    opening: Float[Tensor, "*batch"]
 
 
 def outward_normals(
@@ -222,8 +223,8 @@ def outward_normals(
     needed = torch.cat([inner, gaps.is_line], dim=-1)
     from_first, from_last, from_second = gaps.ends.unsqueeze(-1).unbind(-2)
     near = torch.cat([torch.where(step < 0.5, from_first, from_last), from_second], dim=-1)
-    pointed = (none | gaps.is_wide).squeeze(-1)
-    return OutwardNormals(normals.masked_fill(~needed.unsqueeze(-1), 0.0), near.masked_fill(none, m), pointed)
+    opening = opening.detach().masked_fill(~(none | gaps.is_wide), 0.0).squeeze(-1)
+    return OutwardNormals(normals.masked_fill(~needed.unsqueeze(-1), 0.0), near.masked_fill(none, m), opening)
 
 
 class _Gaps(NamedTuple):

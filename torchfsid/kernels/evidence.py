@@ -17,7 +17,15 @@ import numpy as np
 
 from torchfsid.kernels.compiled import item, launcher
 from torchfsid.kernels.saturation import ROWS, clipped_inverse_optimal, workspace
-from torchfsid.tolerances import ANGLE_TOLERANCE, CRITICAL_NORMALS, NORMALS, RANK_TOLERANCE, ROUND_OFF, SPREAD
+from torchfsid.tolerances import (
+    ANGLE_TOLERANCE,
+    CRITICAL_NORMALS,
+    NORMALS,
+    RANK_TOLERANCE,
+    RELAXED_OPENING,
+    ROUND_OFF,
+    SPREAD,
+)
 
 PI, TURN = math.pi, 2 * math.pi
 DIRECTIONS, CRITICAL_DIRECTIONS = (
@@ -145,13 +153,13 @@ def outward_normals(angle, order, K, none, around, normals, generator):
         generator: to be filled with the name of the generator nearest to each normal.
 
     Returns:
-        The number of normals, and whether the cone is pointed.
+        The number of normals, and the cone's `opening` [rad], as in `OutwardNormals`.
     """
     fan = len(around)
     if K == 0:
         for i in range(fan - 1):
             normals[i, 0], normals[i, 1], generator[i] = around[i, 0], around[i, 1], none
-        return fan - 1, True
+        return fan - 1, TURN
     for i in range(1, K):
         a, g, j = angle[i], order[i], i - 1
         while j >= 0 and angle[j] > a:
@@ -182,7 +190,7 @@ def outward_normals(angle, order, K, none, around, normals, generator):
         direction = angle[second] + PI / 2
         normals[count, 0], normals[count, 1], generator[count] = math.cos(direction), math.sin(direction), order[second]
         count += 1
-    return count, opening > ANGLE_TOLERANCE
+    return count, opening if opening > ANGLE_TOLERANCE else 0.0
 
 
 @item
@@ -299,11 +307,12 @@ def evidence(A, b, hard, relaxed, C, d, u, usable, bound, angles, ball, drift, c
         if not (informative[k] or (relaxes and usable_here and not broken)):
             continue
         found = find_generators(k, unit, active[k] if paper else near, fan, angle, order)
-        count, pointed = outward_normals(angle, order, found, generators, around, normals, generator)
+        count, opening = outward_normals(angle, order, found, generators, around, normals, generator)
         if relaxes:
-            pointed = pointed and not blind
-            alarmed[k], infeasible[k] = strained and pointed, not pointed
-            informative[k] = informative[k] and pointed and not strained
+            pointed = opening > 0 and not blind
+            alarmed[k] = strained and not blind and opening > RELAXED_OPENING
+            informative[k] = pointed and not strained
+            infeasible[k] = not alarmed[k] and not informative[k]
             if not informative[k]:
                 continue
         if paper:
