@@ -98,7 +98,7 @@ class CbfQpController:
     The controller keeps soft barriers like all others. `soft` matters only to observers.
 
     Raises:
-        InputError: there is no barrier.
+        InputError: there is no barrier, or another one beside a barrier that is relaxed: which of them would give way?
     """
 
     task: Task
@@ -107,6 +107,8 @@ class CbfQpController:
     def __post_init__(self) -> None:
         if len(self.barriers) == 0:
             raise InputError("barriers", "at least one barrier", self.barriers)
+        if len(self.barriers) > 1 and any(getattr(barrier, "relaxes", False) for barrier in self.barriers):
+            raise InputError("barriers", "no other barrier beside one that is relaxed (ORCA)", self.barriers)
 
     def __call__(self, measurement: Measurement, theta: Float[Tensor, "*theta_batch p"]) -> Control:
         """The controls for the parameters `theta` (*theta_batch, p). Its batch and the measurement's broadcast.

@@ -42,6 +42,7 @@ from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.speed_disc import SpeedDisc
 from torchfsid.robots.tasks import Task
 from torchfsid.robots.velocity_obstacle import (
+    SINGLE,
     Geometry,
     Pairs,
     Rows,
@@ -52,9 +53,7 @@ from torchfsid.robots.velocity_obstacle import (
     uncertainty,
 )
 
-RELAXED = 0.02
-"""Where rows are violated, a control this close to the speed limit, relative to it, counts as on the limit. The least
-violation may be at a corner of nearly opposite rows, which single precision moves by up to 1 % of the speed."""
+_MEASURED = ("x", "velocity", "bodies", "previous_body_velocities", "radius", "body_radii")
 
 
 @dataclass(frozen=True)
@@ -129,22 +128,22 @@ class Orca:
             at, times = (ux[open_at], uy[open_at], e[open_at], eps[open_at]), (self.time_horizon, self.time_step)
             wide = over_branches(some, own, *at, *times)
             angle, slack = angle.index_put(open_at, wide.angle), slack.index_put(open_at, wide.slack)
-        violation = rows.low - rows.nx * ux - rows.ny * uy
         if not bool((must_be == may_be).all()):
+            violation = rows.low - rows.nx * ux - rows.ny * uy
             slack = torch.where(must_be, slack, torch.maximum(slack, violation))
         of_bodies = RowErrors(torch.where(may_be, angle, 0.0), torch.where(may_be, slack, 0.0))
-        relaxed = (may_be & (violation > slack + bounds.control.unsqueeze(-1))).any(-1, keepdim=True)
-        disc = SpeedDisc(self.max_speed).errors(measurement, bounds)
-        disc = disc._replace(slack=disc.slack + RELAXED * self.max_speed * relaxed)
-        return RowErrors.stack([of_bodies, disc])
+        return RowErrors.stack([of_bodies, SpeedDisc(self.max_speed).errors(measurement, bounds)])
 
     def slack_left_out(self, measurement: Measurement) -> Float[Tensor, "*batch"]:
         """Infinite if bodies without a slot are no neighbours: too far, or behind `count` bodies that are nearer."""
         left_out = measurement.left_out
         assert left_out is not None
         r = (measurement.bodies - measurement.x.unsqueeze(-2)).norm(dim=-1)
-        nearer = (measurement.present & (r < left_out.distance.unsqueeze(-1))).sum(-1)
-        no_neighbour = (left_out.distance >= self.distance) | (nearer >= self.count)
+        if measurement.body_position_error is not None:
+            r = r + measurement.body_position_error
+        least = left_out.distance * (1 - SINGLE)
+        nearer = (measurement.present & (r * (1 + SINGLE) < least.unsqueeze(-1))).sum(-1)
+        no_neighbour = (least >= self.distance) | (nearer >= self.count)
         return torch.where(no_neighbour, math.inf, -math.inf)
 
     def labels(self, bodies: Sequence[str]) -> list[str]:
@@ -155,7 +154,8 @@ class Orca:
         if self._looks and self._looks[0][0] is measurement:
             return self._looks[0][1]
         look = geometry(self._pairs(measurement), self.time_horizon, self.time_step)
-        self._looks[:] = [] if look.rows.low.requires_grad else [(measurement, look)]  # a graph is followed once only
+        differentiable = any(getattr(measurement, name).requires_grad for name in _MEASURED)
+        self._looks[:] = [] if differentiable else [(measurement, look)]  # a graph is followed once only
         return look
 
     def _pairs(self, measurement: Measurement) -> Pairs:
