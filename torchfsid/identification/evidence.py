@@ -135,7 +135,7 @@ class Evidence:
 
 
 @dataclass(frozen=True)
-class _Sample:
+class Sample:
     """The model at one measurement. Its numbers are NaN or infinite where it could not be evaluated.
 
     Attributes:
@@ -166,11 +166,11 @@ class _Sample:
     row_errors: RowErrors | None
     corners: Float[Tensor, "B v p"] | None
 
-    def without(self, items: Int[Tensor, "k"], rows: Int[Tensor, "k"]) -> _Sample:
+    def without(self, items: Int[Tensor, "k"], rows: Int[Tensor, "k"]) -> Sample:
         """The samples at the places `items`, as if the row of the same place in `rows` were inactive."""
         k, m = torch.arange(len(items), device=items.device), self.rows.rows
         errors = self.row_errors
-        return _Sample(
+        return Sample(
             Halfspaces(self.rows.A[items], self.rows.b[items]), torch.zeros_like(self.hard), self.relaxed,
             self.u[items], self.C[items], self.d[items], self.usable[items],
             self.bound.expand(len(self.u), m)[items].index_put((k, rows), self.bound.new_tensor(-torch.inf)),
@@ -197,7 +197,7 @@ def evidence(
         InputError: the measurement has no velocities, they are not finite for an observed robot, the measurement does
             not fit theta, or `compiled` is True where it is not possible.
     """
-    return _read(model, _sample(model, theta, measurement.observed_only()), compiled)
+    return read_sample(model, sample_of(model, theta, measurement.observed_only()), compiled)
 
 
 def by_robot(omega: Halfspaces, t: float | Tensor, robots: int) -> tuple[Halfspaces, float | Tensor]:
@@ -219,17 +219,17 @@ def by_robot(omega: Halfspaces, t: float | Tensor, robots: int) -> tuple[Halfspa
     return Halfspaces(gathered(omega.A), gathered(omega.b), source), gathered(times)
 
 
-def _read(model: ObservationModel, sample: _Sample, compiled: bool | None) -> Evidence:
+def read_sample(model: ObservationModel, sample: Sample, compiled: bool | None) -> Evidence:
     return (_compiled if _can_be_compiled(model, sample, compiled) else _in_torch)(model, sample)
 
 
 def _omega_without(
-    model: ObservationModel, sample: _Sample, items: Int[Tensor, "k"], rows: Int[Tensor, "k"]
+    model: ObservationModel, sample: Sample, items: Int[Tensor, "k"], rows: Int[Tensor, "k"]
 ) -> Halfspaces:
-    return _read(model, sample.without(items, rows), None).omega
+    return read_sample(model, sample.without(items, rows), None).omega
 
 
-def _sample(model: ObservationModel, theta: FeasibleSet, measurement: Measurement) -> _Sample:
+def sample_of(model: ObservationModel, theta: FeasibleSet, measurement: Measurement) -> Sample:
     assert measurement.u is not None
     robots, items, u = theta.batch_shape.numel(), len(measurement.x), measurement.u.to(torch.float64)
     if measurement.x.ndim != 2 or len(theta.batch_shape) != 1 or items % max(robots, 1) != 0:
@@ -276,12 +276,12 @@ def _sample(model: ObservationModel, theta: FeasibleSet, measurement: Measuremen
             ball = ball + model.task.feedback_error(errors)  # type: ignore[attr-defined]
 
     turned = of_rows if of_rows is not None and bool((of_rows.angle > 0).any()) else None
-    return _Sample(
+    return Sample(
         rows, hard, relaxed, u, C.to(torch.float64), d.to(torch.float64), usable, bound, ball, drift, turned, corners,
     )  # fmt: skip
 
 
-def _in_torch(model: ObservationModel, sample: _Sample) -> Evidence:
+def _in_torch(model: ObservationModel, sample: Sample) -> Evidence:
     rows, C, d, usable, u = sample.rows, sample.C, sample.d, sample.usable, sample.u
     if not finite(rows.A, rows.b, C, d):  # padding and zeros in place of what could not be evaluated
         are_known = rows.b.isfinite() & rows.A.isfinite().all(-1)
@@ -315,7 +315,7 @@ def _in_torch(model: ObservationModel, sample: _Sample) -> Evidence:
     return Evidence(omega, informative, alarmed, infeasible, slack, excess, sample.hard, solve, without)
 
 
-def _can_be_compiled(model: ObservationModel, sample: _Sample, wanted: bool | None) -> bool:
+def _can_be_compiled(model: ObservationModel, sample: Sample, wanted: bool | None) -> bool:
     if wanted is False:
         return False
     tensors = [sample.rows.A, sample.rows.b, sample.C, sample.d, sample.u, sample.bound, sample.ball, sample.drift]
@@ -333,7 +333,7 @@ def _can_be_compiled(model: ObservationModel, sample: _Sample, wanted: bool | No
     return obstacle is None
 
 
-def _compiled(model: ObservationModel, sample: _Sample) -> Evidence:
+def _compiled(model: ObservationModel, sample: Sample) -> Evidence:
     angles = sample.u[:, :0] if sample.row_errors is None else sample.row_errors.angle
     tensors = (
         sample.rows.A, sample.rows.b, sample.hard, sample.relaxed, sample.C, sample.d, sample.u, sample.usable,

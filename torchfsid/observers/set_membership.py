@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Literal
 
 import torch
@@ -25,6 +25,7 @@ from torch import Tensor
 from torchfsid.errors import InconsistentError, InputError
 from torchfsid.identification.evidence import Evidence, ObservationModel, SetKind, evidence
 from torchfsid.identification.kkt import KktSolution
+from torchfsid.identification.windows import Windows
 from torchfsid.outcome import Status
 from torchfsid.robots.barriers import Barrier
 from torchfsid.robots.bounds import NoiseBound
@@ -97,6 +98,7 @@ class SetMembershipObserver:
             the prior, for robots that change their goal: the status stays OK, the event is recorded. `raise` raises
             `InconsistentError`.
         compiled: see `evidence`. The sets are the same up to round-off.
+        windows: lengths of windows over positions [s] (`identification.windows`). None: each sample is read by itself.
         model: the declared model as one record.
         prior: the initial sets.
         status: a `Status` per robot.
@@ -117,6 +119,7 @@ class SetMembershipObserver:
     active_tolerance: float = ACTIVE_TOLERANCE
     on_inconsistent: OnInconsistent = "hold"
     compiled: bool | None = None
+    windows: Sequence[float] = ()
     model: ObservationModel = field(init=False)
     prior: FeasibleSet = field(init=False)
     status: Int[Tensor, "B"] = field(init=False)
@@ -132,6 +135,7 @@ class SetMembershipObserver:
         self.model = ObservationModel(self.task, self.barriers, self.kind, self.noise, self.active_tolerance)
         if self.compiled and p != 2:
             raise InputError("compiled", "None or False unless theta is planar", True)
+        self._windows = Windows(self.model, self.windows) if self.windows else None
         self.prior = self.feasible_set
         self.status = torch.zeros_like(self.feasible_set.outcome)
         self.skipped = self.infeasible = torch.zeros_like(self.status)
@@ -144,7 +148,8 @@ class SetMembershipObserver:
             InconsistentError: an intersection is empty, and `on_inconsistent` is `raise`.
         """
         t = measurement.time
-        found = evidence(self.model, self.feasible_set, measurement, self.compiled)
+        read = partial(evidence, self.model) if self._windows is None else self._windows.read
+        found = read(self.feasible_set, measurement, self.compiled)
         narrowed = self.feasible_set.intersect(found.omega, t)
         informative = found.informative
         if narrowed.any_empty or bool(found.alarmed.any()):
@@ -155,6 +160,14 @@ class SetMembershipObserver:
         self.skipped = self.skipped + ~found.informative
         self.infeasible = self.infeasible + found.infeasible
         return SetEstimate(t, self.feasible_set, found, informative, self.status)
+
+    @property
+    def windows_used(self) -> dict[float, float]:
+        """For each length [s], the share of windows that were used."""
+        if self._windows is None:
+            return {}
+        share = self._windows.used / self._windows.ended.clamp(min=1)
+        return dict(zip(self.windows, share.tolist(), strict=True))
 
     def _instead(self) -> FeasibleSet:
         """The sets that replace empty ones: the sets as they were, or the prior."""
