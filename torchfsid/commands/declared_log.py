@@ -30,6 +30,16 @@ LARGEST_OF = {"velocity": "speed", "acceleration": "acceleration"}
 """What a large control is large in."""
 
 
+WINDOWS = (0.1, 0.25, 0.5, 1.0)
+"""Default lengths of windows over positions [s]."""
+
+
+def default_windows(log: Log) -> tuple[float, ...]:
+    """The default lengths that have two samples or more [s]. Two, five and ten samples of a log that is slower."""
+    step = float(np.median(np.diff(log.t)))
+    return tuple(length for length in WINDOWS if length > 1.5 * step) or (2 * step, 5 * step, 10 * step)
+
+
 @dataclass
 class DeclaredLog:
     """A log and the model that its configuration declares.
@@ -68,7 +78,11 @@ class DeclaredLog:
             self.log = self.log if config.velocity == "logged" else self.log.accelerated(noise.arrival)
         else:
             self.log = self.log.of_first_order()
-            self.log = self.log if config.velocity == "logged" else self.log.differentiated()
+            if config.velocity == "windows":
+                self.log = self.log.windowed(config.noise.position)
+                self.config = config.model_copy(update={"windows": config.windows or default_windows(self.log)})
+            elif config.velocity == "differentiated":
+                self.log = self.log.differentiated()
         self.log = bridged(self.log)
         self.robots = config.robots(self.log.bodies)
         self.task = config.task.build(self.log.bodies)

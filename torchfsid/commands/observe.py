@@ -129,13 +129,13 @@ class Observation:
         """Robots that end `ok` but need more than half of the bound on controls: it may hide an error of the model.
 
         This is no alarm, since errors may be as large as declared. The list is empty where the question has no meaning
-        (the bound was determined from the log, sets are reset, critical regions) or takes too long (theta is not
-        planar).
+        (the bound was determined from the log, sets are reset, critical regions, windows over positions) or takes too
+        long (theta is not planar).
         """
         config, sets = self.config, self.sets
         if self.smallest_bounds is not None or config.on_inconsistent == "reset" or sets.kind == "critical_region":
             return []
-        if sets.prior.dim != 2:
+        if sets.prior.dim != 2 or config.velocity == "windows":
             return []
         half = torch.full((len(self.robots),), self.bound_used / AUTO_FACTOR, dtype=torch.float64)
         suffices = self.declared.consistency().sets(half).fits

@@ -17,6 +17,7 @@ from torchfsid.commands.results import seconds
 from torchfsid.commands.task_gain import TaskGain
 from torchfsid.commands.terminal import digits, ends, table
 from torchfsid.observers.safety import SafetyObserver
+from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.outcome import Status
 
 MOST_COLUMNS = 4
@@ -54,6 +55,14 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
             f"Rows may have been infeasible, and the controller took the least violation (of {len(observation.log.t)} "
             f"samples): {escape(', '.join(infeasible))}. These samples are not used."
         )
+    if isinstance(observation.sets, SetMembershipObserver) and observation.sets.windows_used:
+        shares = ", ".join(f"{length:g} s {share:.0%}" for length, share in observation.sets.windows_used.items())
+        console.print(f"Windows over positions that were used: {shares}")
+        if "previous" in observation.config.neighbour_velocities:
+            console.print(
+                "Rows that use velocities (orca, neighbour_velocity: previous) are hardly known from positions: log "
+                "velocities if you can."
+            )
     if observation.task_gain is not None:
         _print_task_gain(observation.task_gain, console)
     if isinstance(observation.sets, SafetyObserver):

@@ -233,7 +233,8 @@ def regions(
             ],
         }
     if not isinstance(observer, SafetyObserver):
-        return {"robots": of_robots}
+        used = {f"{length:g}": share for length, share in observer.windows_used.items()}
+        return {"robots": of_robots, "windows_used": used} if used else {"robots": of_robots}
     seen = seen or Distances()
     for i, robot in enumerate(robots):
         of_robots[robot]["safety"] = safety(observer, i, seen, robots, labels)

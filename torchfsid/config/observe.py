@@ -67,7 +67,9 @@ class ObserveConfig(Strict):
             Eqs. (11), (12), (17)).
         dynamics: robots that are driven by velocities, or by accelerations (`double_integrator`).
         velocity: take controls from the log (`logged`), or from differences (`differentiated`): velocities from those
-            of positions, accelerations from those of velocities.
+            of positions, accelerations from those of velocities. `windows` reads means over windows of positions, whose
+            errors are `noise.position`. `noise.velocity` is then the error of the controllers alone.
+        windows: lengths of these windows [s]. Default: those of 0.1, 0.25, 0.5 and 1 s that have two samples or more.
         obstacles: bodies of the log that are avoided but not inferred.
         on_inconsistent: what happens to a set when the intersection is empty: `hold` keeps it, `reset` starts again
             from the prior, `raise` ends the command.
@@ -82,7 +84,8 @@ class ObserveConfig(Strict):
     set: Literal["inverse_optimal", "critical_region"] = "inverse_optimal"
     active_tolerance: Positive = 1e-3
     dynamics: Dynamics = "single_integrator"
-    velocity: Literal["logged", "differentiated"] = "logged"
+    velocity: Literal["logged", "differentiated", "windows"] = "logged"
+    windows: Annotated[tuple[Positive, ...], Field(min_length=1)] | None = None
     obstacles: tuple[BodyName, ...] = ()
     on_inconsistent: Literal["hold", "reset", "raise"] = "hold"
     bag: BagConfig | None = None
@@ -111,7 +114,24 @@ class ObserveConfig(Strict):
             raise wrong("auto takes an error of the gain for noise, give a number or a known gain", "noise")
         if self.noise.control == "auto" and self.on_inconsistent == "reset":
             raise wrong("auto takes a change of goal for noise, give a number or take on_inconsistent: hold", "noise")
+        self._windows_fit()
         return self
+
+    def _windows_fit(self) -> None:
+        if self.velocity != "windows":
+            if self.windows is not None:
+                raise wrong("expected velocity: windows beside it", "windows")
+            return
+        if self.is_second_order:
+            raise wrong("windows are means of velocities, take differentiated with a double_integrator", "velocity")
+        if self.set == "critical_region":
+            raise wrong("windows need inverse_optimal", "set")
+        if self.is_unknown or self.task.is_unknown:
+            raise wrong("windows need known safety parameters and a known gain", "velocity")
+        if self.on_inconsistent == "reset":
+            raise wrong("a window may span a change of goal, take hold", "on_inconsistent")
+        if self.noise.control == "auto":
+            raise wrong("with windows it is the error of the controllers alone: expected a number", "noise.velocity")
 
     @property
     def is_second_order(self) -> bool:
@@ -184,7 +204,9 @@ class ObserveConfig(Strict):
             known = sets.present_barriers
         else:
             known = [barrier for barrier in barriers if callable(barrier)]
-            sets = SetMembershipObserver(task, known, prior, self.set, noise, tolerance, self.on_inconsistent)
+            sets = SetMembershipObserver(
+                task, known, prior, self.set, noise, tolerance, self.on_inconsistent, windows=self.windows or ()
+            )
         if self.ukf is False:
             return sets
         ukf = self.ukf.build(task, known, self.prior, robots, self.active_tolerance)

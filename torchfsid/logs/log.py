@@ -103,6 +103,18 @@ class Log:
         u = self._quotients(self.x, known, "velocities")
         return replace(self, t=self.t[:-1], x=self.x[:-1], u=u, seen=self.seen[:-1], velocity_known=known)
 
+    def windowed(self, position_error: float) -> Log:
+        """`differentiated`, with bounds on the errors of these velocities, (rho + rho_+) / (t_+ - t).
+
+        Args:
+            position_error: a bound on the errors of all positions [m], beside `position_error` of the log.
+        """
+        rho = np.full(self.seen.shape, position_error) + (0.0 if self.position_error is None else self.position_error)
+        error = (rho[:-1] + rho[1:]) / np.diff(self.t)[:, None]
+        log = Log.differentiated(self)  # differences of these positions, whatever else the log knows
+        kept = None if self.position_error is None else self.position_error[:-1]
+        return replace(log, position_error=kept, velocity_error=error)
+
     def accelerated(self, velocity_error: float) -> Log:
         """The log with accelerations from differences of its velocities (module docstring), without its last time.
 
