@@ -54,6 +54,7 @@ class _Moments:
         t: times [s].
         x: positions [m].
         rho: bounds on their errors [m].
+        observed: whether the robot was observed. A gap of its own ends a window.
         usable: whether the sample may be part of a window.
         angle: directions of the rows [rad].
         half: bounds on their errors [rad].
@@ -66,6 +67,7 @@ class _Moments:
     t: Float[Tensor, "S"]
     x: Float[Tensor, "S B 2"]
     rho: Float[Tensor, "S B"]
+    observed: Bool[Tensor, "S B"]
     usable: Bool[Tensor, "S B"]
     angle: Float[Tensor, "S B m"]
     half: Float[Tensor, "S B m"]
@@ -90,7 +92,7 @@ class Windows:
         model: the declared model. Its `noise.velocity` is the error of the controllers alone.
         lengths: the lengths of the windows [s].
         used: for each length, how many windows of all robots were used.
-        ended: for each length, how many windows of all robots have ended so far.
+        ended: for each length, how many windows of all robots there were so far, without a gap of the robot.
 
     Raises:
         InputError: there are no lengths or they are not positive, or the model's set is not `inverse_optimal`.
@@ -134,24 +136,24 @@ class Windows:
         if not t > float(before.t[-1]):
             raise InputError("measurement.t", f"a time after {float(before.t[-1])}", t)
         self._moments = before.followed_by(now, t - max(self.lengths) * (1 + TIME_ROUND_OFF))
-        observed = torch.ones_like(found.informative) if measurement.observed is None else measurement.observed
-        windows, reached = self._windows(before, now, observed, theta, sample)
-        if not bool(reached.any()):
+        windows, whole = self._windows(before, now, theta, sample)
+        if not bool(whole.any()):
             return found
         of_windows = read_sample(self.model, windows, compiled)
         says = of_windows.informative.unflatten(0, (len(self.lengths), -1))
-        self.used, self.ended = self.used + says.sum(1), self.ended + reached * len(observed)
-        omega, _ = by_robot(of_windows.omega, t, len(observed))
+        self.used, self.ended = self.used + says.sum(1), self.ended + whole.sum(1)
+        omega, _ = by_robot(of_windows.omega, t, len(measurement.x))
         return replace(found, omega=Halfspaces.stack([found.omega, omega]), informative=found.informative | says.any(0))
 
     def _moment(self, measurement: Measurement, sample: Sample, found: Evidence) -> _Moments:
-        noise, errors, A = self.model.noise, sample.row_errors, sample.rows.A
+        noise, errors, A, observed = self.model.noise, sample.row_errors, sample.rows.A, measurement.observed
         assert noise is not None
         rho = torch.full_like(sample.u[:, 0], noise.position)
         if measurement.position_error is not None:
             rho = rho + measurement.position_error
         of_robots = (
-            measurement.x, rho, found.informative, torch.atan2(A[..., 1], A[..., 0]),
+            measurement.x, rho, torch.ones_like(found.informative) if observed is None else observed,
+            found.informative, torch.atan2(A[..., 1], A[..., 0]),
             torch.zeros_like(sample.rows.b) if errors is None else errors.angle,
             (2 * found.slack + found.excess <= 0) & (A != 0).any(-1),  # slack <= room = -excess - slack
             sample.C, sample.d, sample.drift.expand(len(rho)),
@@ -159,10 +161,10 @@ class Windows:
         return _Moments(measurement.x.new_tensor([measurement.time]), *(value.unsqueeze(0) for value in of_robots))
 
     def _windows(
-        self, before: _Moments, now: _Moments, observed: Bool[Tensor, "B"], theta: FeasibleSet, sample: Sample
-    ) -> tuple[Sample, Bool[Tensor, "L"]]:
-        """The L windows of each robot as L*B samples, whose rows are fans, and whether samples reach that far back."""
-        L, B, t, saturation = len(self.lengths), len(observed), now.t, self.model.task.saturation
+        self, before: _Moments, now: _Moments, theta: FeasibleSet, sample: Sample
+    ) -> tuple[Sample, Bool[Tensor, "L B"]]:
+        """The L windows of each robot as L*B samples, whose rows are fans, and which of them have no gap."""
+        L, B, t, saturation = len(self.lengths), now.x.shape[1], now.t, self.model.task.saturation
         length = before.t.new_tensor(self.lengths)
         inside = before.t >= (t - length * (1 + TIME_ROUND_OFF)).unsqueeze(-1)
         count = inside.sum(-1)
@@ -184,7 +186,8 @@ class Windows:
             mean(before.d),
             mean(before.drift),
         )
-        usable = (before.usable | ~inside.unsqueeze(-1)).all(1) & observed & reached.unsqueeze(-1)
+        whole = (before.observed | ~inside.unsqueeze(-1)).all(1) & now.observed & reached.unsqueeze(-1)
+        usable = whole & (before.usable | ~inside.unsqueeze(-1)).all(1)
         noise = self.model.noise
         assert noise is not None
         ball = torch.as_tensor(noise.velocity).to(u) + (now.rho + before.rho[first]) / T.unsqueeze(-1)
@@ -202,7 +205,7 @@ class Windows:
         A, b, u, C, d, usable, ball, drift = (v.flatten(0, 1) for v in (A, b, u, C, d, usable, ball, drift))
         no_row = torch.zeros_like(sample.hard)
         corners = corners.expand(L, B, *corners.shape[1:]).flatten(0, 1)
-        return Sample(Halfspaces(A, b), no_row, no_row, u, C, d, usable, nothing, ball, drift, errors, corners), reached
+        return Sample(Halfspaces(A, b), no_row, no_row, u, C, d, usable, nothing, ball, drift, errors, corners), whole
 
 
 def _hull(

@@ -15,6 +15,9 @@ body in the log, in place of v,
 Proof: x - x_true = (1 - l) (x(s) - x_true) + l (x(s + h) - x_true), and x_true is at most l h v away from x(s) and (1 -
 l) h v from x(s + h). The same holds for u.
 
+A body that is seen at s but not at the next sample has no velocity from differences of positions. Its velocity is then
+0 with an error of v as well, while its position is exact.
+
 A row of such a body is an ordinary row with wider bounds. It is left out where it is provably inactive. It counts as
 active in every direction where the body may be anywhere around the robot. The sample says nothing about the missing
 robot itself. Before its first and after its last sample a body is not there.
@@ -34,7 +37,9 @@ def bridged(log: Log) -> Log:
     earlier = np.maximum.accumulate(np.where(log.seen, np.arange(len(log.t))[:, None], -1), axis=0)
     later = np.minimum.accumulate(np.where(log.seen, np.arange(len(log.t))[:, None], len(log.t))[::-1], axis=0)[::-1]
     gap = ~log.seen & (earlier >= 0) & (later < len(log.t))
-    if log.lost is not None or not gap.any():
+    goes_on = np.arange(len(log.t))[:, None] < earlier[-1]
+    unknown = log.seen & ~log.velocity_known & goes_on & (log.u is not None and log.a is None)
+    if log.lost is not None or not (gap | unknown).any():
         return log
     k, j = np.nonzero(gap)
     before, after = earlier[k, j], later[k, j]
@@ -56,10 +61,10 @@ def bridged(log: Log) -> Log:
         log,
         x=between(log.x),
         seen=log.seen | gap,
-        velocity_known=log.velocity_known | gap,
-        position_error=in_gaps(weight * fastest, log.position_error),
-        velocity_error=in_gaps(fastest, log.velocity_error),
-        bridged=gap,
+        velocity_known=log.velocity_known | gap | unknown,
+        position_error=in_gaps(weight * fastest, log.position_error) if gap.any() else log.position_error,
+        velocity_error=in_gaps(fastest, log.velocity_error) + fastest * unknown,
+        bridged=gap | unknown,
     )
     if log.a is None or log.acceleration_known is None or log.u is None:
         return filled
