@@ -154,7 +154,9 @@ def validate(mapping: Mapping[Any, Any], model: type[Config], source: str) -> Co
     try:
         return model.model_validate(mapping)
     except ValidationError as error:
-        first, *others = error.errors(include_url=False)
+        first, *rest = error.errors(include_url=False)
+        # An entry that is wrong also leaves its list too short: a mistake that follows from another is not counted.
+        others = [other for other in rest if first["loc"][: len(other["loc"])] != other["loc"]]
         more = f" (and {len(others)} more)" if others else ""
         raise ConfigError(f"{source}: {_path(first, mapping)}: {_sentence(first)}{more}") from error
 

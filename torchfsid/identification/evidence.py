@@ -259,7 +259,7 @@ def sample_of(model: ObservationModel, theta: FeasibleSet, measurement: Measurem
     if errors is not None:
         of_rows = row_errors(model.barriers, parts, measurement, errors)
         bound = bound + of_rows.slack
-    usable = ~controller_failed(model.barriers, measurement, rows, of_rows)
+    usable = ~controller_failed(model.barriers, measurement, rows, of_rows, ball)
     if measurement.observed is not None:
         usable = usable & measurement.observed
     if measurement.left_out is not None:

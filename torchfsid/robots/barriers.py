@@ -102,20 +102,24 @@ def row_errors(
 
 
 def controller_failed(
-    barriers: Sequence[Barrier], measurement: Measurement, rows: Halfspaces, errors: RowErrors | None = None
+    barriers: Sequence[Barrier],
+    measurement: Measurement,
+    rows: Halfspaces,
+    errors: RowErrors | None = None,
+    control_error: Float[Tensor, "*#batch"] | float = 0.0,
 ) -> Bool[Tensor, "*batch"]:
     """May the controller of a robot have found no solution? Then it commands exactly zero, which says nothing of theta.
 
-    A robot's own QP has failed if its control is zero and zero violates one of its `rows`. It may have failed if zero
-    violates a row that is wrong by at most its `errors`. A joint QP that fails stops the whole team. So it may have
-    failed whenever all controls are zero.
+    A robot's own QP has failed if its control is zero, within `control_error`, and zero violates one of its `rows`. It
+    may have failed if zero violates a row that is wrong by at most its `errors`. A joint QP that fails stops the whole
+    team. So it may have failed whenever all controls are exactly zero.
     """
     assert measurement.u is not None
-    stopped = (measurement.u == 0).all(-1)
+    stopped = measurement.u.norm(dim=-1) <= control_error
     if not bool(stopped.any()):
         return stopped
     least = torch.zeros_like(rows.b) if errors is None else errors.slack * rows.norms()
-    failed = stopped & (rows.b < least).any(-1)
+    failed, stopped = stopped & (rows.b < least).any(-1), (measurement.u == 0).all(-1)
     perhaps_joint = any(getattr(barrier, "neighbour_velocity", None) in ("current", None) for barrier in barriers)
     controls = measurement.body_velocities if measurement.body_accelerations is None else measurement.body_accelerations
     if perhaps_joint and controls is not None:

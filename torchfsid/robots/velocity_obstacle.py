@@ -100,10 +100,15 @@ def is_open(look: Geometry, e: Float[Tensor, "*batch m"], eps: Float[Tensor, "*b
 
 
 def uncertainty(pairs: Pairs, bounds: ErrorBounds) -> tuple[Float[Tensor, "*batch m"], Float[Tensor, "*batch m"]]:
-    """e [m] and eps [m/s], single precision included."""
+    """e [m] and eps [m/s], single precision included.
+
+    Velocities before t were measured as the controls are, so they are no better known.
+    """
     e = pairs.scale * (bounds.position.unsqueeze(-1) + bounds.body_position) + SINGLE * pairs.r
     speeds = pairs.mx.abs() + pairs.my.abs() + pairs.wx.abs() + pairs.wy.abs()
-    return e, bounds.velocity.unsqueeze(-1) + bounds.body_velocity + SINGLE * speeds
+    control = bounds.control.unsqueeze(-1)
+    own, others = torch.maximum(bounds.velocity.unsqueeze(-1), control), torch.maximum(bounds.body_velocity, control)
+    return e, own + others + SINGLE * speeds
 
 
 def branch_errors(
