@@ -13,12 +13,15 @@ from torchfsid.commands.check import Check
 from torchfsid.commands.hypotheses import Hypotheses, HypothesisVerdict
 from torchfsid.commands.judged_bound import JudgedBound
 from torchfsid.commands.observe import Observation, Verdict
-from torchfsid.commands.results import seconds
+from torchfsid.commands.results import STATUS_NAMES, constraint_name, seconds
 from torchfsid.commands.task_gain import TaskGain
 from torchfsid.commands.terminal import digits, ends, table
 from torchfsid.observers.safety import SafetyObserver
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.outcome import Status
+
+MOST_EVENTS = 8
+"""Contradictions that are printed."""
 
 MOST_COLUMNS = 4
 """Models beyond which the table of hypotheses has a line, not a column, for each."""
@@ -55,6 +58,7 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
             f"Rows may have been infeasible, and the controller took the least violation (of {len(observation.log.t)} "
             f"samples): {escape(', '.join(infeasible))}. These samples are not used."
         )
+    _print_events(observation, console)
     if isinstance(observation.sets, SetMembershipObserver) and observation.sets.windows_used:
         shares = ", ".join(f"{length:g} s {share:.0%}" for length, share in observation.sets.windows_used.items())
         console.print(f"Windows over positions that were used: {shares}")
@@ -77,6 +81,28 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
     files = ("estimates.csv", "regions.json", "config.yaml", "regions.png", "regions.pdf", "safety.png", "safety.pdf")
     there = ", ".join(file for file in files if (out / file).is_file())
     console.print(escape(f"Results: {out}/{there}"))
+
+
+def _print_events(observation: Observation, console: Console) -> None:
+    """Print when and by which rows the robots were first contradicted."""
+    events, labels = observation.sets.events, observation.declared.row_labels
+    for event in events[:MOST_EVENTS]:
+        rows = dict.fromkeys(
+            constraint_name(source, labels) + ("" if math.isnan(time) or time == event.t else f" at {seconds(time)}")
+            for time, source in event.rows
+        )
+        what = "is violated" if event.status == Status.ALARM else "contradict each other"
+        named = ", ".join(rows) or "the prior"
+        console.print(
+            escape(
+                f"{observation.robots[event.robot]} at {seconds(event.t)}: {STATUS_NAMES[event.status]}: {named} {what}"
+            ),
+            soft_wrap=True,
+        )
+    if len(events) > MOST_EVENTS:
+        console.print(f"... and {len(events) - MOST_EVENTS} more, see regions.json")
+    if any(verdict.status != "ok" for verdict in observation.verdicts()):
+        console.print("torchfsid check says which rows and which bounds do not fit.")
 
 
 def _print_task_gain(found: TaskGain, console: Console) -> None:
