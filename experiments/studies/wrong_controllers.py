@@ -1,8 +1,8 @@
 """What an observer reports when the controller is of another kind, or ORCA's horizon or radii are wrong.
 
 `python -m experiments.studies.wrong_controllers` prints a table of docs/wrong_models.md. Random teams cross, driven by
-ORCA or by barrier rows, and are measured exactly. A robot interacts if a row ever holds it back from its nominal
-control by more than the declared bound. Only these robots can show that rows are wrong.
+ORCA, by barrier rows or by barrier rows over accelerations, and are measured exactly. A robot interacts if a row ever
+holds it back from its nominal control by more than the declared bound. Only these robots can show that rows are wrong.
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ from torchfsid.observers.consistency import Consistency
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.outcome import Status
 from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
-from torchfsid.robots.barriers import Barrier
+from torchfsid.robots.barriers import Barrier, SpeedBox
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.orca import Orca
+from torchfsid.robots.second_order import SecondOrderAvoidance
 from torchfsid.robots.simulation import Trajectory, simulate
 from torchfsid.robots.tasks import GoalTask, Saturation
 from torchfsid.sets.feasible_set import FeasibleSet
@@ -37,14 +38,21 @@ ROBOTS = (8, 20)
 TASK = GoalTask(GAIN, saturation=Saturation("norm", (1.0, 1.0)))
 ORCA = Orca(time_horizon=2.0, time_step=DT, max_speed=1.3, count=8, distance=6.0)
 CBF = CollisionAvoidance(ClassK(2.0), margin=0.05)
+DAMPED = GoalTask(0.6, damping=1.4)
+SECOND = (SecondOrderAvoidance((1.5, 2.0), margin=0.05), SpeedBox((2.0, 2.0), quantity="acceleration"))
+
+RUNS: dict[str, tuple[GoalTask, Sequence[Barrier]]]
+RUNS = {"ORCA": (TASK, (ORCA,)), "barrier rows": (TASK, (CBF,)), "accelerations": (DAMPED, SECOND)}
+"""Tasks and barriers of the robots."""
 
 
 @dataclass(frozen=True)
 class Team:
-    """A run, the goals [m] and the robots that interact."""
+    """A run, the goals [m] and the task of its robots."""
 
     run: Trajectory
     goals: Tensor
+    task: GoalTask
 
     @property
     def interacts(self) -> Tensor:
@@ -56,9 +64,8 @@ class Team:
     @property
     def gets_free(self) -> Tensor:
         """The robots that are free at some time, with a nominal control that is not clipped."""
-        run, limits = self.run, TASK.saturation
-        assert limits is not None
-        slow = run.nominal.norm(dim=-1) < 0.99 * limits.limits[0]
+        run, limits = self.run, self.task.saturation
+        slow = run.nominal.norm(dim=-1) < (math.inf if limits is None else 0.99 * limits.limits[0])
         return (slow & ((run.u - run.nominal).norm(dim=-1) < 1e-9) & ~run.active.any(-1)).any(0)
 
     @property
@@ -87,32 +94,46 @@ def too_late(sample: Measurement) -> Measurement:
     return replace(sample, velocity=sample.u, previous_body_velocities=sample.body_velocities)
 
 
+def as_first_order(sample: Measurement) -> Measurement:
+    """Take the velocities of robots of second order for their controls."""
+    return replace(sample, u=sample.velocity, velocity=None, body_accelerations=None)
+
+
 @dataclass(frozen=True)
 class Belief:
-    """The barrier that an observer assumes, and the barrier that the robots have."""
+    """The barriers and the task that an observer assumes, and the run that it sees."""
 
     name: str
-    barrier: Barrier
-    run: Barrier = ORCA
+    barriers: Sequence[Barrier]
+    run: str = "ORCA"
     seen: Callable[[Measurement], Measurement] = as_it_is
+    task: GoalTask = TASK
 
 
+JOINT = replace(CBF, neighbour_velocity="current")
+SLOW = GoalTask(0.6 / 1.4)
 BELIEFS = (
-    Belief("ORCA: right model", ORCA),
-    Belief("ORCA: time horizon + 20 %", replace(ORCA, time_horizon=1.2 * ORCA.time_horizon)),
-    Belief("ORCA: time horizon - 20 %", replace(ORCA, time_horizon=0.8 * ORCA.time_horizon)),
-    Belief("ORCA: radii + 20 %", ORCA, seen=radii(1.2)),
-    Belief("ORCA: radii - 20 %", ORCA, seen=radii(0.8)),
-    Belief("ORCA: velocities of the same sample", ORCA, seen=too_late),
-    Belief("ORCA: barrier rows assumed", CBF),
-    Belief("ORCA: joint barrier rows assumed", replace(CBF, neighbour_velocity="current")),
-    Belief("barrier rows: right model", CBF, CBF),
-    Belief("barrier rows: ORCA assumed", ORCA, CBF),
+    Belief("ORCA: right model", [ORCA]),
+    Belief("ORCA: time horizon + 20 %", [replace(ORCA, time_horizon=1.2 * ORCA.time_horizon)]),
+    Belief("ORCA: time horizon - 20 %", [replace(ORCA, time_horizon=0.8 * ORCA.time_horizon)]),
+    Belief("ORCA: radii + 20 %", [ORCA], seen=radii(1.2)),
+    Belief("ORCA: radii - 20 %", [ORCA], seen=radii(0.8)),
+    Belief("ORCA: velocities of the same sample", [ORCA], seen=too_late),
+    Belief("ORCA: barrier rows assumed", [CBF]),
+    Belief("ORCA: joint barrier rows assumed", [JOINT]),
+    Belief("barrier rows: right model", [CBF], "barrier rows"),
+    Belief("barrier rows: ORCA assumed", [ORCA], "barrier rows"),
+    Belief("accelerations: right model", SECOND, "accelerations", task=DAMPED),
+    Belief("accelerations: single integrators", [CBF], "accelerations", as_first_order, GoalTask(0.6)),
+    Belief("accelerations: single integrators, slow", [CBF], "accelerations", as_first_order, SLOW),
+    Belief("accelerations: single integrators, joint rows", [JOINT], "accelerations", as_first_order, SLOW),
+    Belief("accelerations: no damping", SECOND, "accelerations", task=GoalTask(0.6)),
 )
 
 
-def simulated(barrier: Barrier, seed: int) -> Team:
-    """A team that crosses: from a ring to the other side, or to a random place on it."""
+def simulated(kind: str, seed: int) -> Team:
+    """A team of `RUNS` that crosses: from a ring to the other side, or to a random place on it."""
+    task, barriers = RUNS[kind]
     generator = torch.Generator().manual_seed(seed)
     robots = int(torch.randint(ROBOTS[0], ROBOTS[1] + 1, (), generator=generator))
 
@@ -124,8 +145,10 @@ def simulated(barrier: Barrier, seed: int) -> Team:
     other = start if seed % 2 else -start[torch.randperm(robots, generator=generator)]
     goals = -other + 0.4 * (uniform(robots, 2) - 0.5)
     radius = 0.15 + 0.15 * uniform(robots)
-    run = simulate(CbfQpController(TASK, [barrier]), goals, start, dt=DT, steps=STEPS, radius=radius)
-    return Team(run, goals)
+    velocity = torch.zeros_like(start) if kind == "accelerations" else None
+    controller = CbfQpController(task, barriers)
+    run = simulate(controller, goals, start, dt=DT, steps=STEPS, radius=radius, velocity=velocity)
+    return Team(run, goals, task)
 
 
 @dataclass(frozen=True)
@@ -149,7 +172,7 @@ class Ending:
 
 def ending(belief: Belief, team: Team) -> Ending:
     """Observe a team with the barrier of the belief."""
-    observer = SetMembershipObserver(TASK, [belief.barrier], team.prior, noise=NoiseBound(BOUND))
+    observer = SetMembershipObserver(belief.task, belief.barriers, team.prior, noise=NoiseBound(BOUND))
     relaxed = 0
     for sample in team.run.measurements():
         relaxed += int(observer.update(belief.seen(sample)).evidence.infeasible.sum())
@@ -157,7 +180,7 @@ def ending(belief: Belief, team: Team) -> Ending:
     return Ending(
         observer.status != Status.OK,
         observer.feasible_set.contains(team.goals),
-        observer.feasible_set.diameter() / (2 * BOUND / GAIN),
+        observer.feasible_set.diameter() / (2 * BOUND / belief.task.gain),
         relaxed / samples,
         int(observer.skipped.sum()) / samples,
     )
@@ -166,9 +189,10 @@ def ending(belief: Belief, team: Team) -> Ending:
 def judged(belief: Belief, team: Team) -> JudgedBound:
     """The bound that `velocity: auto` takes for a team. It is infinite if none explains all of its robots."""
     samples = [belief.seen(sample) for sample in team.run.measurements()]
-    consistency = Consistency(samples, TASK, [belief.barrier], team.prior)
+    consistency = Consistency(samples, belief.task, belief.barriers, team.prior)
     bound = AUTO_FACTOR * float(consistency.smallest_bounds(consistency.fastest).max())
-    return JudgedBound.of(bound, team.run.u.norm(dim=-1).flatten().numpy())
+    controls = torch.stack([sample.u for sample in samples if sample.u is not None])
+    return JudgedBound.of(bound, controls.norm(dim=-1).flatten().numpy())
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -178,8 +202,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--auto", action="store_true", help="judge the bound that velocity: auto would take, too")
     chosen = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    teams: dict[Barrier, list[Team]]
-    teams = {barrier: [simulated(barrier, seed) for seed in range(chosen.teams)] for barrier in (ORCA, CBF)}
+    teams = {kind: [simulated(kind, seed) for seed in range(chosen.teams)] for kind in RUNS}
     heads = ("model", "robots", "interact", "flagged of them", "flagged of others", "ok, outside", "relaxed", "unused")
     heads = (*heads, "diameter") + (("auto: useless or none", "share") if chosen.auto else ())
     print(f"| {' | '.join(heads)} |\n|{'---|' * len(heads)}")
