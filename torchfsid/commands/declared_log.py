@@ -11,7 +11,7 @@ import numpy as np
 
 from torchfsid.commands.judged_bound import SUSPECTS, JudgedBound
 from torchfsid.config.observe import ObserveConfig
-from torchfsid.config.unknown_numbers import UnknownNumber, replaced
+from torchfsid.config.unknown_numbers import replaced
 from torchfsid.errors import ConfigError
 from torchfsid.logs.gaps import bridged
 from torchfsid.logs.log import Log
@@ -158,10 +158,10 @@ class DeclaredLog:
         other.config = self.config.with_bound(bound)
         return other
 
-    def with_numbers(self, numbers: Sequence[UnknownNumber], intervals: Sequence[tuple[float, float]]) -> DeclaredLog:
+    def with_numbers(self, intervals: Sequence[tuple[float, float]]) -> DeclaredLog:
         """The same log and model with other intervals for its unknown numbers."""
         other = copy(self)
-        for number, interval in zip(numbers, intervals, strict=True):
+        for number, interval in zip(self.config.unknown_numbers, intervals, strict=True):
             other.config = replaced(other.config, number.path, interval)
         other.task = other.config.task.build(self.log.bodies)
         other.barriers = other.config.build_barriers(self.log.bodies, self._radius)
