@@ -128,8 +128,8 @@ class ObserveConfig(Strict):
             raise wrong("windows are means of velocities, take differentiated with a double_integrator", "velocity")
         if self.set == "critical_region":
             raise wrong("windows need inverse_optimal", "set")
-        if self.is_unknown or self.task.is_unknown:
-            raise wrong("windows need known safety parameters and a known gain", "velocity")
+        if self.is_unknown or self.unknown_numbers:
+            raise wrong("windows need known safety parameters and known numbers", "velocity")
         if self.on_inconsistent == "reset":
             raise wrong("a window may span a change of goal, take hold", "on_inconsistent")
         if self.noise.control == "auto":
