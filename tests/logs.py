@@ -12,15 +12,19 @@ from torchfsid.robots.simulation import Trajectory
 
 
 def write_log(path: Path, run: Trajectory, bodies: Sequence[str], errors: Tensor | None = None) -> Path:
-    """A run as CSV, with errors (samples, bodies, 2) added to its controls."""
+    """A run as CSV, with its radii if it has any, and errors (samples, bodies, 2) added to its controls."""
     u = run.u if errors is None else run.u + errors
     columns = {"x": run.x, "v": u} if run.velocity is None else {"x": run.x, "v": run.velocity, "a": u}
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["t", "robot", "x", "y", "vx", "vy", "ax", "ay"][: 2 + 2 * len(columns)])
+        radius = [[] for _ in bodies] if run.radius is None else run.radius.unsqueeze(-1).tolist()
+        names = ["t", "robot", "x", "y", "vx", "vy", "ax", "ay"][: 2 + 2 * len(columns)]
+        writer.writerow([*names, *(["radius"] if run.radius is not None else [])])
         for k, t in enumerate(run.t.tolist()):
             for j, body in enumerate(bodies):
-                writer.writerow([t, body, *(value for of in columns.values() for value in of[k, j].tolist())])
+                writer.writerow(
+                    [t, body, *(value for of in columns.values() for value in of[k, j].tolist()), *radius[j]]
+                )
     return path
 
 

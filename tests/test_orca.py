@@ -3,6 +3,7 @@
 import itertools
 import math
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -140,9 +141,12 @@ def test_no_truth_is_lost_among_rvo2_agents(kind: str, rho: float) -> None:
 
 
 def test_rows_hold_for_all_errors_within_their_bounds() -> None:
-    """A truly active row is measured active, and in a direction within its angle, even if the branch is another."""
+    """A truly active row is measured active, and in a direction within its angle, even if the branch is another.
+
+    Neither the horizon nor the margin need be known: they are at corners of their intervals, or somewhere between.
+    """
     generator = torch.Generator().manual_seed(4)
-    orca, B, reached = Orca(2.0, 0.1, 1.5, 5, 1e3), 40000, 0.0
+    B, reached = 20000, 0.0
 
     def normal(*shape: int) -> Tensor:
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
@@ -151,7 +155,13 @@ def test_rows_hold_for_all_errors_within_their_bounds() -> None:
         direction = normal(*shape)
         return bound * direction / direction.norm(dim=-1, keepdim=True)
 
-    for e, eps in [(0.002, 0.0), (0.01, 0.01), (0.05, 0.02), (0.0, 0.05)]:
+    known = [(e, eps, 0.0, 0.0, 0.0, 0.0) for e, eps in [(0.002, 0.0), (0.01, 0.01), (0.05, 0.02), (0.0, 0.05)]]
+    unknown = [
+        (e, eps, 0.05, 0.03, *at) for e, eps in [(0.0, 0.0), (0.01, 0.01)] for at in product((-1, 0.3, 1), (-1, 1))
+    ]
+    for e, eps, tau, sigma, at_tau, at_sigma in [*known, *unknown, (0, 0, 0.2, 0, 1, 0), (0, 0, 0, 0.1, 0, -1)]:
+        orca = Orca(2.0, 0.1, 1.5, 5, 1e3, margin=0.1, rate_error=tau, margin_error=sigma)
+        own = replace(orca, time_horizon=1 / (0.5 + at_tau * tau), margin=0.1 + at_sigma * sigma, rate_error=0.0)
         x, v, others = normal(B, 2), 0.5 * normal(B, 2), 0.5 * normal(B, 1, 2)
         away = normal(B, 2)
         body = (x + away / away.norm(dim=-1, keepdim=True) * (0.4 + 2 * normal(B, 1).abs() ** 2)).unsqueeze(-2)
@@ -160,7 +170,7 @@ def test_rows_hold_for_all_errors_within_their_bounds() -> None:
             0.0, x, None, body, torch.ones(B, 1, dtype=torch.bool), previous_body_velocities=others, velocity=v,
             radius=radius, body_radii=radius.unsqueeze(-1),
         )  # fmt: skip
-        row = orca(true)
+        row = own(true)
         n, low = -row.A[:, 0], -row.b[:, 0]
         across = torch.stack([-n[:, 1], n[:, 0]], dim=-1)
         u = n * low.unsqueeze(-1) + across * normal(B, 1)  # on the boundary of the true row

@@ -247,13 +247,6 @@ REFUSED = {
         {"barriers": [{**AVOIDANCE, "class_k": [{"gain": 1.5}, {"gain": 1.0, "power": 3}]}]},
         "barriers[0].class_k[1].power: expected 1",
     ),
-    "unknown gain": (
-        {"barriers": [{**AVOIDANCE, "class_k": [{"gain": [1, 2]}, {"gain": 1.0}]}]},
-        "barriers[0].class_k[0].gain: expected a number",
-    ),
-    "unknown distance": (
-        {"barriers": [{**AVOIDANCE, "safety_distance": [0.3, 0.5]}]}, "barriers[0].safety_distance: expected a number",
-    ),
     "neighbours' velocities": (
         {"barriers": [{**AVOIDANCE, "neighbour_velocity": "current"}]}, "did you mean 'neighbour_acceleration'?",
     ),

@@ -141,7 +141,7 @@ def test_an_unknown_gain_of_the_task_is_narrowed(log: Path, tmp_path: Path, caps
     for robot, goal in GOALS.items():
         inside = torch.tensor(regions[robot]["A"]) @ torch.tensor(goal) <= torch.tensor(regions[robot]["b"]) + 1e-5
         assert bool(inside.all())
-    assert "gain of the task" in capsys.readouterr().out
+    assert "task.gain: " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -199,7 +199,7 @@ def test_wrong_intervals_are_refused_by_their_path(change: dict, message: str) -
         ({"barriers": [AVOIDANCE, AVOIDANCE]}, r"barriers\[1\]: one barrier may have unknown parameters"),
         (
             {"task": {"kind": "goal", "gain": [0.5, 1]}, "noise": {"velocity": "auto"}},
-            "noise: auto takes an error of the gain",
+            "noise: auto takes an error of task.gain",
         ),
         ({"task": {"kind": "goal", "gain": [0.5, 1], "dead_zone": 0.1}}, "task.gain: expected a known gain"),
     ],

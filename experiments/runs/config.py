@@ -19,6 +19,7 @@ from torchfsid.config.observe import AnyNoiseConfig, Dynamics, require_one_order
 from torchfsid.config.observers import PriorConfig, UkfConfig
 from torchfsid.config.quantities import BodyName, NonNegative, Number, PlanarVector, Positive, known
 from torchfsid.config.tasks import GoalConfig
+from torchfsid.config.unknown_numbers import unknown_numbers
 
 SetKind = Literal["critical_region", "inverse_optimal"]
 
@@ -147,8 +148,8 @@ class ExperimentConfig(Strict):
 
     @model_validator(mode="after")
     def _can_be_simulated(self) -> Self:
-        if self.task.is_unknown:
-            raise wrong("expected a number, not [low, high]: robots that are simulated have it", "task.gain")
+        for number in unknown_numbers(self.task, self.barriers):
+            raise wrong("expected a number, not [low, high]: robots that are simulated have it", number.name)
         for i, barrier in enumerate(self.barriers):
             if barrier.is_unknown:
                 raise wrong("expected numbers, not [low, high]: robots that are simulated have them", f"barriers[{i}]")

@@ -17,6 +17,7 @@ from torch import Tensor
 from torchfsid.commands.check_safety import SafetyCheck, check_safety
 from torchfsid.commands.declared_log import AUTO_FACTOR, LARGEST_OF, DeclaredLog
 from torchfsid.commands.judged_bound import SUSPECTS, JudgedBound
+from torchfsid.commands.narrowing import Narrowing, narrowed
 from torchfsid.commands.results import constraint_name, seconds
 from torchfsid.observers.consistency import Consistency, Fit
 
@@ -93,6 +94,7 @@ class Check:
         shifts: number of samples by which controls are taken later, to the `smallest_bound` then. It is infinite if it
             is not below that without a shift.
         safety: what the log says about gain and safety distance. None where that is not asked.
+        narrowing: what is left of the unknown numbers at the declared bound. All else holds for what is left.
     """
 
     robots: tuple[RobotCheck, ...]
@@ -103,6 +105,7 @@ class Check:
     bound: JudgedBound
     shifts: dict[int, float]
     safety: SafetyCheck | None
+    narrowing: Narrowing | None = None
 
     @property
     def smallest_bound(self) -> float:
@@ -126,6 +129,7 @@ class Check:
         lines = [f"nothing can be said of {', '.join(silent)}: no sample could be used"] if silent else []
         if len(silent) == len(self.robots):
             return lines
+        lines += [] if self.narrowing is None else self.narrowing.said()
         lines.append(self._fit())
         controls = {"velocity": "velocities", "acceleration": "accelerations"}[self.quantity]
         if len(self.shifts) == 1:
@@ -189,6 +193,7 @@ class Check:
             "shifts": {str(shift): _finite(bound) for shift, bound in sorted(self.shifts.items())},
             "conclusions": self.conclusions(),
             "safety": None if self.safety is None else self.safety.to_json(),
+            "unknown_numbers": None if self.narrowing is None else self.narrowing.to_json(),
             "robots": {
                 robot.robot: {
                     "smallest_bound": _finite(robot.smallest_bound),
@@ -208,7 +213,10 @@ class Check:
 
 
 def check(declared: DeclaredLog) -> Check:
-    """Check a log against the model that is declared for it."""
+    """Check a log against the model that is declared for it. Its unknown numbers are narrowed first."""
+    narrowing = None
+    if declared.config.unknown_numbers:
+        declared, narrowing = narrowed(declared)
     consistency = declared.consistency()
     fastest = consistency.fastest
     bounds = consistency.smallest_bounds(fastest)
@@ -246,7 +254,7 @@ def check(declared: DeclaredLog) -> Check:
             )
         )
     is_auto, safety = noise.control == "auto", check_safety(declared)
-    return Check(tuple(robots), noise.quantity, bound, is_auto, fastest, judged, shifts, safety)
+    return Check(tuple(robots), noise.quantity, bound, is_auto, fastest, judged, shifts, safety, narrowing)
 
 
 class _Faults:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from torchfsid.commands.judged_bound import SUSPECTS, JudgedBound
 from torchfsid.config.observe import ObserveConfig
+from torchfsid.config.unknown_numbers import replaced
 from torchfsid.errors import ConfigError
 from torchfsid.logs.gaps import bridged
 from torchfsid.logs.log import Log
@@ -64,7 +65,7 @@ class DeclaredLog:
     prior: FeasibleSet = field(init=False)
 
     def __post_init__(self) -> None:
-        config, radius = self.config, None if self.log.radius is None else self.log.radius.tolist()
+        config = self.config
         if self.log.x.shape[-1] != 2:
             raise ConfigError("task: planar controllers only, but the log has a column z")
         if config.is_second_order:
@@ -86,7 +87,7 @@ class DeclaredLog:
         self.log = bridged(self.log)
         self.robots = config.robots(self.log.bodies)
         self.task = config.task.build(self.log.bodies)
-        self.barriers = config.build_barriers(self.log.bodies, radius)
+        self.barriers = config.build_barriers(self.log.bodies, self._radius)
         self.prior = config.prior.build(len(self.robots))
 
     def _require_accelerations(self) -> None:
@@ -157,12 +158,18 @@ class DeclaredLog:
         other.config = self.config.with_bound(bound)
         return other
 
-    def with_task_gain(self, gain: tuple[float, float]) -> DeclaredLog:
-        """The same log and model with another interval for the gain of its task [1/s]."""
+    def with_numbers(self, intervals: Sequence[tuple[float, float]]) -> DeclaredLog:
+        """The same log and model with other intervals for its unknown numbers."""
         other = copy(self)
-        other.config = self.config.model_copy(update={"task": self.config.task.model_copy(update={"gain": gain})})
+        for number, interval in zip(self.config.unknown_numbers, intervals, strict=True):
+            other.config = replaced(other.config, number.path, interval)
         other.task = other.config.task.build(self.log.bodies)
+        other.barriers = other.config.build_barriers(self.log.bodies, self._radius)
         return other
+
+    @property
+    def _radius(self) -> list[float] | None:
+        return None if self.log.radius is None else self.log.radius.tolist()
 
     def judged(self, bound: float) -> JudgedBound:
         """A bound on the error of controls, judged by the controls of the inferred robots.

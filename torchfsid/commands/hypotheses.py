@@ -25,7 +25,8 @@ class HypothesisVerdict:
 
     Attributes:
         status: `ok`, `alarm` or `inconsistent`, see `Status`. `inconsistent` means refuted.
-        refuted_at: when its set became empty [s], or None.
+        refuted_at: when its set became empty [s], or None. It is refuted without a time if no values of its unknown
+            numbers explain the motion.
         evidence: times [s] and labels of the rows that contradict each other then. The time of the prior is None.
         volume: volume of its set at the end.
         bound_useless: it is left only with a bound that leaves wrong models, too, see `JudgedBound`.
@@ -36,6 +37,11 @@ class HypothesisVerdict:
     evidence: tuple[tuple[float | None, str], ...]
     volume: float
     bound_useless: bool
+
+    @property
+    def is_refuted(self) -> bool:
+        """Can it not be true?"""
+        return self.status == STATUS_NAMES[Status.INCONSISTENT]
 
     def to_json(self) -> dict:
         """The entry of `hypotheses.json`."""

@@ -12,14 +12,15 @@ import torch
 
 from torchfsid.commands.declared_log import AUTO_FACTOR, DeclaredLog, automatic_bound
 from torchfsid.commands.judged_bound import JudgedBound
+from torchfsid.commands.narrowing import Narrowing, narrowed
 from torchfsid.commands.results import STATUS_NAMES, ResultsWriter, constraint_name, of_sets, seconds
-from torchfsid.commands.task_gain import TaskGain, narrowed
 from torchfsid.config.observe import ObserveConfig
 from torchfsid.errors import FsidError, InconsistentError
 from torchfsid.identification.kkt import CASES
 from torchfsid.logs.log import Log
 from torchfsid.observers.hybrid import HybridObserver
 from torchfsid.observers.safety import SafetyObserver, SetObserver
+from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.outcome import Status
 from torchfsid.robots.measurement import Measurement
 
@@ -71,7 +72,8 @@ class Observation:
         observer: `sets` alone, or combined with the filter if the configuration has one.
         smallest_bounds: with `auto`, each robot's smallest bound on controls that explains its motion [`noise.unit`].
         bound: the bound in use, judged by the controls seen.
-        task_gain: where the gain of the task is unknown, the gains that can explain the log.
+        narrowing: where numbers of the model are unknown, what is left of them. `declared` has that. Robots that no
+            values explain are `inconsistent` from the start.
 
     Raises:
         ConfigError: no bound explains some robot, see `automatic_bound`.
@@ -83,7 +85,7 @@ class Observation:
     stated: ObserveConfig = field(init=False)
     smallest_bounds: dict[str, float] | None = field(init=False, default=None)
     bound: JudgedBound = field(init=False)
-    task_gain: TaskGain | None = field(init=False, default=None)
+    narrowing: Narrowing | None = field(init=False, default=None)
     _cases: dict[str, Counter[str]] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -93,11 +95,14 @@ class Observation:
             self.declared = self.declared.with_bound(found)
         self.stated = self.declared.config
         self.bound = self.declared.judged(self.bound_used)
-        if self.config.task.is_unknown:
-            self.declared, self.task_gain = narrowed(self.declared)
+        if self.config.unknown_numbers:
+            self.declared, self.narrowing = narrowed(self.declared)
         self._cases = {robot: Counter() for robot in self.robots}
         self.observer = self.config.build_observer(self.declared.task, self.declared.barriers, len(self.robots))
         self.sets = self.observer.sets if isinstance(self.observer, HybridObserver) else self.observer
+        if self.narrowing is not None and isinstance(self.sets, SetMembershipObserver):
+            unexplained = torch.tensor([robot in self.narrowing.unexplained for robot in self.robots])
+            self.sets.status = torch.where(unexplained, Status.INCONSISTENT, self.sets.status)
 
     @property
     def config(self) -> ObserveConfig:

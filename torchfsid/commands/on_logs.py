@@ -26,8 +26,8 @@ from torchfsid.logs.read import read_log
 FILES = ("estimates.csv", "regions.json", "regions.png", "regions.pdf")
 """What an observation leaves beside config.yaml."""
 
-UNKNOWN_FILES = ("safety.png", "safety.pdf", "task_gain.json")
-"""What it leaves besides, where safety parameters or the gain of the task are unknown."""
+UNKNOWN_FILES = ("safety.png", "safety.pdf", "unknown_numbers.json", "task_gain.json")
+"""What it leaves besides, where safety parameters or other numbers of the model are unknown."""
 
 CHECKED = "check.json"
 
@@ -57,8 +57,10 @@ def observe_log(path: Path, models: Mapping[str, ObserveConfig], folder: Results
             if name:
                 out.mkdir(exist_ok=True)
                 write_whole(out / "config.yaml", dump(observation.stated))
-            if observation.task_gain is not None:
-                write_json(out / "task_gain.json", observation.task_gain.to_json())
+            if observation.narrowing is not None:
+                write_json(out / "unknown_numbers.json", observation.narrowing.to_json())
+                if "task.gain" in observation.narrowing.numbers:
+                    write_json(out / "task_gain.json", observation.narrowing.numbers["task.gain"].to_json())
             observation.run(out, partial(track, what=f"Observing {name}".strip(), total=observation.samples))
             with status("Drawing"):
                 seen = observation.log
@@ -98,7 +100,7 @@ def check_log(path: Path, models: Mapping[str, ObserveConfig], folder: ResultsFo
 
 def _ready(models: Mapping[str, DeclaredLog]) -> Observation | Hypotheses:
     first = next(iter(models.values()))
-    auto, gain = first.config.noise.control == "auto", any(model.config.task.is_unknown for model in models.values())
-    finding = status("Narrowing the gain" if gain else "Finding the bound", computes=True)
-    with finding if auto or gain else nullcontext():
+    auto, unknown = first.config.noise.control == "auto", any(model.config.unknown_numbers for model in models.values())
+    finding = status("Narrowing unknown numbers" if unknown else "Finding the bound", computes=True)
+    with finding if auto or unknown else nullcontext():
         return Hypotheses(models) if len(models) > 1 else Observation(first)

@@ -14,7 +14,6 @@ from torchfsid.commands.hypotheses import Hypotheses, HypothesisVerdict
 from torchfsid.commands.judged_bound import JudgedBound
 from torchfsid.commands.observe import Observation, Verdict
 from torchfsid.commands.results import STATUS_NAMES, constraint_name, seconds
-from torchfsid.commands.task_gain import TaskGain
 from torchfsid.commands.terminal import digits, ends, table
 from torchfsid.observers.safety import SafetyObserver
 from torchfsid.observers.set_membership import SetMembershipObserver
@@ -67,8 +66,8 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
                 "Rows that use velocities (orca, neighbour_velocity: previous) are hardly known from positions: log "
                 "velocities if you can."
             )
-    if observation.task_gain is not None:
-        _print_task_gain(observation.task_gain, console)
+    if observation.narrowing is not None:
+        _print_lines(observation.narrowing.said(), console)
     if isinstance(observation.sets, SafetyObserver):
         _print_safety(observation.sets, observation.robots, observation.declared.row_labels, console)
     noise = observation.config.noise
@@ -105,13 +104,9 @@ def _print_events(observation: Observation, console: Console) -> None:
         console.print("torchfsid check says which rows and which bounds do not fit.")
 
 
-def _print_task_gain(found: TaskGain, console: Console) -> None:
-    declared = f"declared {ends(found.declared)}"
-    if not found.explains:
-        console.print(f"no gain of the task explains the log ({declared})")
-        return
-    said = "" if all(found.by_data) else "; * not bounded by the data"
-    console.print(f"gain of the task: {ends(found.found, found.by_data)} {found.unit} ({declared}{said})")
+def _print_lines(lines: Sequence[str], console: Console) -> None:
+    for line in lines:
+        console.print(escape(line), soft_wrap=True)
 
 
 def _print_safety(observer: SafetyObserver, robots: Sequence[str], labels: Sequence[str], console: Console) -> None:
@@ -154,7 +149,7 @@ def print_hypotheses(hypotheses: Hypotheses, out: Path, console: Console) -> Non
     names, found = list(hypotheses.observations), hypotheses.verdicts()
     cells = {robot: [_cell(of_robot.get(name)) for name in names] for robot, of_robot in found.items()}
     left = [
-        ", ".join(name for name in names if name in of_robot and of_robot[name].refuted_at is None) or _red("none")
+        ", ".join(name for name in names if name in of_robot and not of_robot[name].is_refuted) or _red("none")
         for of_robot in found.values()
     ]
     if len(names) <= MOST_COLUMNS:
@@ -171,9 +166,8 @@ def print_hypotheses(hypotheses: Hypotheses, out: Path, console: Console) -> Non
         column.justify = "left"
     console.print(verdicts)
     for name, observation in hypotheses.observations.items():
-        if observation.task_gain is not None:
-            console.print(f"[bold]{escape(name)}[/]: ", end="")
-            _print_task_gain(observation.task_gain, console)
+        if observation.narrowing is not None:
+            _print_lines([f"{name}: {line}" for line in observation.narrowing.said()], console)
         sets = observation.sets
         explains_some = bool((sets.status < Status.INCONSISTENT).any())
         if isinstance(sets, SafetyObserver) and sets.team_is_refuted and explains_some:
@@ -189,6 +183,8 @@ def _cell(verdict: HypothesisVerdict | None) -> str:
         return "-"
     if verdict.refuted_at is not None:
         return f"refuted at {seconds(verdict.refuted_at)} by {' / '.join(_rows(verdict))}"
+    if verdict.is_refuted:
+        return "refuted: no values of its unknown numbers explain it"
     alarm = "" if verdict.status == "ok" else f", {_red(verdict.status)}"
     bound = " (bound useless)" if verdict.bound_useless else ""
     return f"possible{bound}, volume {_size(verdict.volume)}{alarm}"

@@ -16,7 +16,9 @@ from torchfsid.config.quantities import (
     NonNegativeOrInterval,
     Positive,
     PositiveOrInterval,
+    Units,
     as_interval,
+    as_middle,
     known,
     require_body,
     require_interval,
@@ -70,7 +72,6 @@ class _KeepsDistance(Strict):
     safety_distances: dict[BodyName, Positive] = Field(default_factory=dict)
     margin: NonNegativeOrInterval | None = None
     soft: Flag = False
-    uncertain: ClassVar[bool] = False
 
     @model_validator(mode="after")
     def _one_distance(self) -> _KeepsDistance:
@@ -132,6 +133,8 @@ class AvoidanceConfig(_KeepsDistance):
     neighbour_velocity: Literal["none", "current", "previous"] = "none"
     shared: Literal["team", "robot"] | None = None
     is_second_order: ClassVar[bool] = False
+    uncertain: ClassVar[bool] = False
+    narrowed: ClassVar[Units] = {}
 
     @field_validator("class_k", mode="before")
     @classmethod
@@ -186,7 +189,9 @@ class AvoidanceConfig(_KeepsDistance):
 
 
 class SecondOrderAvoidanceConfig(_KeepsDistance):
-    """`SecondOrderAvoidance`, of robots that are driven by accelerations. All values are known.
+    """`SecondOrderAvoidance`, of robots that are driven by accelerations.
+
+    Gains, safety distance and margin may be unknown within [low, high].
 
     Attributes:
         order: 2.
@@ -202,17 +207,28 @@ class SecondOrderAvoidanceConfig(_KeepsDistance):
     neighbour_acceleration: Literal["none", "current"] = "none"
     is_unknown: ClassVar[bool] = False
     is_second_order: ClassVar[bool] = True
+    narrowed: ClassVar[Units] = {
+        ("class_k", 0, "gain"): "1/s",
+        ("class_k", 1, "gain"): "1/s",
+        ("safety_distance",): "m",
+        ("margin",): "m",
+    }
 
     @model_validator(mode="after")
-    def _is_known(self) -> SecondOrderAvoidanceConfig:
+    def _is_linear(self) -> SecondOrderAvoidanceConfig:
         for i, class_k in enumerate(self.class_k):
             if class_k.power != 1:
                 raise wrong(f"expected 1 with order: 2, got {class_k.power:g}", f"class_k[{i}].power")
-        values = {f"class_k[{i}].gain": class_k.gain for i, class_k in enumerate(self.class_k)}
-        for key, value in {**values, "safety_distance": self.safety_distance, "margin": self.margin}.items():
-            if isinstance(value, tuple):
-                raise wrong("expected a number, not [low, high]: unknown values need order: 1", key)
+        if self.safety_distances and isinstance(self.safety_distance, tuple):
+            raise wrong(
+                "bodies have no distances of their own where the safety distance is unknown", "safety_distances"
+            )
         return self
+
+    @property
+    def uncertain(self) -> bool:
+        values = (*(class_k.gain for class_k in self.class_k), self.safety_distance, self.margin)
+        return any(isinstance(value, tuple) for value in values)
 
     @property
     def neighbour_velocity(self) -> Literal["none", "current"]:
@@ -227,11 +243,17 @@ class SecondOrderAvoidanceConfig(_KeepsDistance):
         """
         from torchfsid.robots.second_order import SecondOrderAvoidance
 
-        k1, k2 = (known(class_k.gain) for class_k in self.class_k)
-        assert k1 is not None
-        assert k2 is not None
-        Ds, margin = self._distances(bodies), known(self.margin)
-        return SecondOrderAvoidance((k1, k2), Ds, margin, self.neighbour_acceleration, self.soft)
+        (k1, of_1), (k2, of_2) = (as_middle(class_k.gain) for class_k in self.class_k)
+        margin, error = None, 0.0
+        if self.margin is not None:
+            Ds, (margin, error) = None, as_middle(self.margin)
+        elif isinstance(self.safety_distance, tuple):
+            Ds, error = as_middle(self.safety_distance)
+        else:
+            Ds = self._distances(bodies)
+        return SecondOrderAvoidance(
+            (k1, k2), Ds, margin, self.neighbour_acceleration, self.soft, (of_1, of_2), distance_error=error
+        )
 
 
 def _commonest_sum(radius: Sequence[float]) -> float:

@@ -12,8 +12,20 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from torchfsid.config.avoidance import AvoidanceConfig, ClassKConfig, SecondOrderAvoidanceConfig
-from torchfsid.config.documents import Strict
-from torchfsid.config.quantities import Flag, NonNegative, PlanarVector, Positive, require_box
+from torchfsid.config.documents import Strict, wrong
+from torchfsid.config.quantities import (
+    Flag,
+    NonNegative,
+    NonNegativeOrInterval,
+    PlanarVector,
+    Positive,
+    PositiveOrInterval,
+    Units,
+    as_interval,
+    as_middle,
+    require_box,
+    require_interval,
+)
 from torchfsid.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -26,6 +38,7 @@ class _RobotsOwn(Strict):
     is_unknown: ClassVar[bool] = False
     is_second_order: ClassVar[bool] = False
     uncertain: ClassVar[bool] = False
+    narrowed: ClassVar[Units] = {}
 
     @property
     def uses_radius(self) -> bool:
@@ -135,20 +148,31 @@ class OrcaConfig(Strict):
         time_step: its time step [s].
         max_speed: its speed limit [m/s].
         neighbours: the bodies that it avoids.
-        margin: distance that is added to the sum of two radii [m].
+        margin: distance that is added to the sum of two radii [m]. Like the horizon it may be unknown, [low, high].
         push_away: a neighbour nearer than the radii and this counts as being there [m].
     """
 
     kind: Literal["orca"] = "orca"
-    time_horizon: Positive
+    time_horizon: PositiveOrInterval
     time_step: Positive
     max_speed: Positive
     neighbours: NeighboursConfig
-    margin: NonNegative = 0.0
+    margin: NonNegativeOrInterval = 0.0
     push_away: NonNegative = 0.0
     is_unknown: ClassVar[bool] = False
     is_second_order: ClassVar[bool] = False
     uncertain: ClassVar[bool] = True
+    narrowed: ClassVar[Units] = {("time_horizon",): "s", ("margin",): "m"}
+
+    @model_validator(mode="after")
+    def _is_ordered(self) -> OrcaConfig:
+        require_interval("time_horizon", self.time_horizon)
+        require_interval("margin", self.margin)
+        if as_interval(self.margin)[0] < 0:
+            raise wrong(f"expected distances >= 0, got {self.margin}", "margin")
+        if self.push_away and isinstance(self.margin, tuple):
+            raise wrong("expected a known margin with push_away", "margin")
+        return self
 
     @property
     def uses_radius(self) -> bool:
@@ -166,21 +190,26 @@ class OrcaConfig(Strict):
         """
         if radius is None:
             raise ConfigError("barriers: orca needs the radii, but the log has none (column radius, bag.radius)")
-        if self.margin + min(radius) <= 0:
+        if as_interval(self.margin)[0] + min(radius) <= 0:
             raise ConfigError("barriers: orca needs positive radii, or a margin")
 
     def build(self, bodies: Sequence[str]) -> Barrier:
         """The barrier. It does not depend on the bodies' names."""
         from torchfsid.robots.orca import Orca
 
+        low, high = as_interval(self.time_horizon)
+        rate, rate_error = as_middle((1 / high, 1 / low))
+        margin, margin_error = as_middle(self.margin)
         return Orca(
-            self.time_horizon,
+            1 / rate if low < high else low,
             self.time_step,
             self.max_speed,
             self.neighbours.count,
             self.neighbours.distance,
-            self.margin,
+            margin,
             self.push_away,
+            rate_error,
+            margin_error,
         )
 
 

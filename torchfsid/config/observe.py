@@ -18,6 +18,7 @@ from torchfsid.config.documents import Strict, wrong
 from torchfsid.config.observers import AccelerationNoiseConfig, ObservedNoiseConfig, PriorConfig, UkfConfig
 from torchfsid.config.quantities import BodyName, Positive, require_body
 from torchfsid.config.tasks import TaskConfig
+from torchfsid.config.unknown_numbers import UnknownNumber, unknown_numbers
 from torchfsid.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -106,12 +107,13 @@ class ObserveConfig(Strict):
             raise wrong("critical_region knows no saturation or dead zone, take inverse_optimal", "set")
         if self.set == "critical_region" and any(barrier.uncertain for barrier in self.barriers):
             raise wrong("critical_region needs rows that are known exactly, take inverse_optimal", "set")
-        if self.task.is_unknown and self.set == "critical_region":
-            raise wrong("critical_region needs a known gain, take inverse_optimal", "set")
-        if self.task.is_unknown and self.on_inconsistent == "reset":
-            raise wrong("a gain can be narrowed only where robots keep their goals", "on_inconsistent")
-        if self.task.is_unknown and self.noise.control == "auto":
-            raise wrong("auto takes an error of the gain for noise, give a number or a known gain", "noise")
+        for number in self.unknown_numbers[:1]:
+            if self.set == "critical_region":
+                raise wrong(f"critical_region needs a known {number.name}, take inverse_optimal", "set")
+            if self.on_inconsistent == "reset":
+                raise wrong(f"{number.name} can be narrowed only where robots keep their goals", "on_inconsistent")
+            if self.noise.control == "auto":
+                raise wrong(f"auto takes an error of {number.name} for noise, give a number or a known value", "noise")
         if self.noise.control == "auto" and self.on_inconsistent == "reset":
             raise wrong("auto takes a change of goal for noise, give a number or take on_inconsistent: hold", "noise")
         self._windows_fit()
@@ -126,8 +128,8 @@ class ObserveConfig(Strict):
             raise wrong("windows are means of velocities, take differentiated with a double_integrator", "velocity")
         if self.set == "critical_region":
             raise wrong("windows need inverse_optimal", "set")
-        if self.is_unknown or self.task.is_unknown:
-            raise wrong("windows need known safety parameters and a known gain", "velocity")
+        if self.is_unknown or self.unknown_numbers:
+            raise wrong("windows need known safety parameters and known numbers", "velocity")
         if self.on_inconsistent == "reset":
             raise wrong("a window may span a change of goal, take hold", "on_inconsistent")
         if self.noise.control == "auto":
@@ -141,6 +143,11 @@ class ObserveConfig(Strict):
     def with_bound(self, bound: float) -> ObserveConfig:
         """The same configuration with another bound on the error of controls [`noise.unit`]."""
         return self.model_copy(update={"noise": self.noise.with_control(bound)})
+
+    @property
+    def unknown_numbers(self) -> list[UnknownNumber]:
+        """The numbers given as [low, high] that are narrowed from a log before it is observed."""
+        return unknown_numbers(self.task, self.barriers)
 
     @property
     def is_unknown(self) -> bool:

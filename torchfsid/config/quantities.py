@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import reprlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag
@@ -61,6 +61,13 @@ NonNegativeOrInterval = Annotated[
 """A number >= 0, or bounds [low, high] on one that is not known."""
 
 
+Path = tuple[str | int, ...]
+"""Where a value stands in a section: keys, and places in lists."""
+
+Units = Mapping[Path, str]
+"""The units of the numbers of a section that may be unknown, and are then narrowed from a log."""
+
+
 def require_body(path: str, name: str, bodies: Sequence[str]) -> None:
     """Check that a body named in the file is in the log.
 
@@ -79,6 +86,12 @@ def require_body(path: str, name: str, bodies: Sequence[str]) -> None:
 def as_interval(value: float | tuple[float, ...]) -> tuple[float, float]:
     """The interval [low, high], or that of a known number."""
     return (value[0], value[1]) if isinstance(value, tuple) else (value, value)
+
+
+def as_middle(value: float | tuple[float, ...]) -> tuple[float, float]:
+    """The middle of an interval and half its width; zero for a known number."""
+    low, high = as_interval(value)
+    return (low + high) / 2, (high - low) / 2
 
 
 def known(value: float | tuple[float, ...] | None) -> float | None:

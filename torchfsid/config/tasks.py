@@ -16,7 +16,9 @@ from torchfsid.config.quantities import (
     PlanarVector,
     Positive,
     PositiveOrInterval,
+    Units,
     as_interval,
+    as_middle,
     require_body,
     require_interval,
 )
@@ -60,9 +62,9 @@ class _Task(Strict):
         return False
 
     @property
-    def is_unknown(self) -> bool:
-        """Is the gain given as [low, high]?"""
-        return False
+    def narrowed(self) -> Units:
+        """The numbers that may be given as [low, high]."""
+        return {}
 
     @property
     def needs_velocity(self) -> str | None:
@@ -122,7 +124,7 @@ class GoalConfig(_Task):
         if self.gain is None:
             return self
         require_interval("gain", self.gain)
-        if self.is_unknown and self.dead_zone > 0:
+        if isinstance(self.gain, tuple) and self.dead_zone > 0:
             raise wrong("expected a known gain with a dead_zone", "gain")
         if self.damping is not None and self.velocity_loop is not None:
             raise wrong("expected damping or velocity_loop, got both", "velocity_loop")
@@ -134,8 +136,9 @@ class GoalConfig(_Task):
         return self
 
     @property
-    def is_unknown(self) -> bool:
-        return isinstance(self.gain, tuple)
+    def narrowed(self) -> Units:
+        """The unit of the gain of robots with damping is that of robots that are driven by accelerations."""
+        return {("gain",): "1/s" if self.damping is None else "1/s2"}
 
     @property
     def needs_velocity(self) -> str | None:
@@ -152,11 +155,6 @@ class GoalConfig(_Task):
         limit = self.saturation.limit
         return (limit[0], limit[1]) if isinstance(limit, tuple) else (limit, limit)
 
-    @property
-    def gain_unit(self) -> str:
-        """The unit of the gain of robots with damping is that of robots that are driven by accelerations."""
-        return "1/s" if self.damping is None else "1/s2"
-
     def build(self, bodies: Sequence[str]) -> Task:
         """The `GoalTask` with these values."""
         from torchfsid.robots.tasks import GoalTask, Saturation
@@ -165,8 +163,7 @@ class GoalConfig(_Task):
             saturation = Saturation("norm", (self.speed, self.speed), dead_speed=self.speed)
             return GoalTask(self.speed / self.tolerance, saturation=saturation)
         assert self.gain is not None
-        low, high = as_interval(self.gain)
-        gain, error = (low + high) / 2, (high - low) / 2
+        gain, error = as_middle(self.gain)
         saturation = None
         if self.is_clipped:
             shape = "norm" if self.saturation is None else self.saturation.kind

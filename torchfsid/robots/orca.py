@@ -12,10 +12,12 @@ With p = x_j - x_i, w_rel = v_i - v_j, v the velocities executed until t, R the 
 The controller keeps the rows of the `count` nearest neighbours nearer than `distance`, and |u| <= max_speed. Where that
 is impossible, it takes the control with the least violation, whatever its task (`relaxes`).
 
-Bounds on errors, with e = rho_i + rho_j, eps = eps_i + eps_j and r = |p|:
+Bounds on errors, with e = rho_i + rho_j, eps = eps_i + eps_j, r = |p|, tau the error of 1/T, sigma that of R, and
+q = 1/T + tau the largest 1/T. With T and R known, tau = sigma = 0.
 
-    angle    leg: asin(e/r) + asin(R/(r - e)) - asin(R/r)          circle: asin((eps + e/T)/|w|)
-    slack    eps/2 + 2 sin(angle/2) |u - (v_i + v_j)/2|     [circle: + (e + 2 sin(angle/2) r)/(2 T)]
+    angle    leg: asin(e/r) + asin((R + sigma)/(r - e)) - asin(R/r)          circle: asin((eps + e q + r tau)/|w|)
+    slack    eps/2 + 2 sin(angle/2) |u - (v_i + v_j)/2|
+             [circle: + (tau |R + n.p| + q (sigma + e + 2 sin(angle/2) r))/2]
 
 If the errors leave open which branch the controller took, a row covers all branches that it may have taken: its angle
 reaches their directions, its slack reaches their slacks. The programs compute in single precision, so that positions
@@ -44,6 +46,7 @@ from torchfsid.robots.tasks import Task
 from torchfsid.robots.velocity_obstacle import (
     SINGLE,
     Geometry,
+    Horizon,
     Pairs,
     Rows,
     branch_errors,
@@ -68,10 +71,13 @@ class Orca:
         distance: the distance within which bodies are neighbours [m].
         margin: added to the sum of the radii [m].
         push_away: a neighbour nearer than R + this is taken to be there [m]; 0 for none (navground: 0.002).
+        rate_error: tau, by which 1/time_horizon may be wrong [1/s].
+        margin_error: sigma, by which `margin` may be wrong [m]. Rows then hold for all horizons and margins within.
 
     Raises:
-        InputError: a value is not positive (margin and push_away: not negative). When called: the measurement has no
-            radii or no velocities before t.
+        InputError: a value is not positive (margin, push_away and errors: not negative), `rate_error` reaches
+            1/time_horizon, or bodies are pushed away to a distance that is not known. When called: the measurement has
+            no radii or no velocities before t.
     """
 
     time_horizon: float
@@ -81,6 +87,8 @@ class Orca:
     distance: float
     margin: float = 0.0
     push_away: float = 0.0
+    rate_error: float = 0.0
+    margin_error: float = 0.0
     relaxes: ClassVar[bool] = True
     uncertain: ClassVar[bool] = True
     neighbour_velocity: ClassVar[NeighbourVelocity] = "previous"
@@ -90,9 +98,13 @@ class Orca:
         for name in ("time_horizon", "time_step", "max_speed", "count", "distance"):
             if not getattr(self, name) > 0:
                 raise InputError(name, "a positive number", getattr(self, name))
-        for name in ("margin", "push_away"):
+        for name in ("margin", "push_away", "rate_error", "margin_error"):
             if not getattr(self, name) >= 0:
-                raise InputError(name, "a distance >= 0 [m]", getattr(self, name))
+                raise InputError(name, "a number >= 0", getattr(self, name))
+        if not self.rate_error < 1 / self.time_horizon:
+            raise InputError("rate_error", f"less than 1/time_horizon = {1 / self.time_horizon:g}", self.rate_error)
+        if self.push_away and self.margin_error:
+            raise InputError("margin_error", "0 with push_away", self.margin_error)
 
     @property
     def soft(self) -> bool:
@@ -110,7 +122,7 @@ class Orca:
     def rows_within(self, measurement: Measurement, bounds: ErrorBounds) -> Halfspaces:
         """The rows of all bodies that may be among the chosen neighbours."""
         look = self._look(measurement)
-        e, _ = uncertainty(look.pairs, bounds)
+        e = uncertainty(look.pairs, bounds).e
         return self._stacked(look.rows, self._chosen(measurement, look.pairs.r, e)[0], measurement)
 
     def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
@@ -118,15 +130,15 @@ class Orca:
         assert measurement.u is not None
         look = self._look(measurement)
         pairs, rows = look.pairs, look.rows
-        e, eps = uncertainty(pairs, bounds)
-        may_be, must_be = self._chosen(measurement, pairs.r, e)
-        ux, uy = (component.unsqueeze(-1).expand_as(e) for component in measurement.u.unbind(-1))
-        angle, slack = branch_errors(pairs, rows, ux, uy, e, eps, look.T, look.on_circle)
-        open_at = (is_open(look, e, eps) & may_be).nonzero(as_tuple=True)
+        wrong = uncertainty(pairs, bounds, self.margin_error)
+        may_be, must_be = self._chosen(measurement, pairs.r, wrong.e)
+        ux, uy = (component.unsqueeze(-1).expand_as(wrong.e) for component in measurement.u.unbind(-1))
+        angle, slack = branch_errors(pairs, rows, ux, uy, wrong, look.horizon, look.on_circle)
+        open_at = (is_open(look, wrong) & may_be).nonzero(as_tuple=True)
         if len(open_at[0]):
             some, own = Pairs._make(v[open_at] for v in pairs), Rows._make(v[open_at] for v in rows)
-            at, times = (ux[open_at], uy[open_at], e[open_at], eps[open_at]), (self.time_horizon, self.time_step)
-            wide = over_branches(some, own, *at, *times)
+            there = wrong._replace(e=wrong.e[open_at], eps=wrong.eps[open_at])
+            wide = over_branches(some, own, ux[open_at], uy[open_at], there, *self._horizons)
             angle, slack = angle.index_put(open_at, wide.angle), slack.index_put(open_at, wide.slack)
         if not bool((must_be == may_be).all()):
             violation = rows.low - rows.nx * ux - rows.ny * uy
@@ -149,11 +161,16 @@ class Orca:
     def labels(self, bodies: Sequence[str]) -> list[str]:
         return [*(f"avoid {body}" for body in bodies), "speed"]
 
+    @property
+    def _horizons(self) -> tuple[Horizon, Horizon]:
+        """Of bodies that are apart, and of bodies that overlap."""
+        return Horizon(self.time_horizon, self.rate_error), Horizon(self.time_step)
+
     def _look(self, measurement: Measurement) -> Geometry:
         """The rows' geometry. It is kept, since rows and errors of one measurement ask for it in turn."""
         if self._looks and self._looks[0][0] is measurement:
             return self._looks[0][1]
-        look = geometry(self._pairs(measurement), self.time_horizon, self.time_step)
+        look = geometry(self._pairs(measurement), *self._horizons)
         differentiable = any(getattr(measurement, name).requires_grad for name in _MEASURED)
         self._looks[:] = [] if differentiable else [(measurement, look)]  # a graph is followed once only
         return look

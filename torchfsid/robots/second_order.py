@@ -10,6 +10,8 @@ joint QP over the team). The velocities v and v_j are states at t, like position
 With r = |dx|, e = dx/r, s = |dv| and K = k1 + k2, the unit row has the slack
 
     s^2/r  +  e.(K dv + a [- a_j])  +  k1 k2 (r - Ds^2/r)/2        [m/s2].
+
+The gains occur in K and k1 k2 only: k1 and k2 can be exchanged.
 """
 
 from __future__ import annotations
@@ -46,10 +48,12 @@ class SecondOrderAvoidance:
         margin: distance between the discs of two bodies [m].
         neighbour_acceleration: which accelerations of other bodies the rows use.
         soft: the controller may violate the rows.
+        gain_errors: by how much k1 and k2 may be wrong [1/s].
+        distance_error: by how much the safety distance or the margin may be wrong [m].
 
     Raises:
-        InputError: a gain is not positive, or not exactly one of the distances is given. When called: the measurement
-            lacks velocities, or radii or accelerations that the rows use.
+        InputError: a gain is not positive, an error is negative, or not exactly one of the distances is given. When
+            called: the measurement lacks velocities, or radii or accelerations that the rows use.
     """
 
     gains: tuple[float | Tensor, float | Tensor]
@@ -57,12 +61,20 @@ class SecondOrderAvoidance:
     margin: float | None = None
     neighbour_acceleration: NeighbourAcceleration = "none"
     soft: bool = False
+    gain_errors: tuple[float, float] = (0.0, 0.0)
+    distance_error: float = 0.0
     order: ClassVar[int] = 2
 
     def __post_init__(self) -> None:
         require_distance(self.safety_distance, self.margin)
         if len(self.gains) != 2 or not min(self.gains) > 0:
             raise InputError("gains", "two positive numbers [1/s]", self.gains)
+        if not min(*self.gain_errors, self.distance_error) >= 0:
+            raise InputError("gain_errors, distance_error", ">= 0", (self.gain_errors, self.distance_error))
+
+    @property
+    def uncertain(self) -> bool:
+        return max(*self.gain_errors, self.distance_error) > 0
 
     @property
     def neighbour_velocity(self) -> NeighbourVelocity:
@@ -79,16 +91,20 @@ class SecondOrderAvoidance:
         return Halfspaces(-2 * dx, b).where(measurement.present)
 
     def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
-        """Bounds on the errors of the rows, with r known up to rho, dv up to sigma and a_j up to tau.
+        """Bounds on the errors of the rows, with r known up to rho, dv up to sigma, a_j up to tau, K up to kappa, k1 k2
+        up to pi and Ds up to eps.
 
         e is wrong by at most the angle asin(rho/r), and is unknown if rho >= r. The slack at the measured control a is
         wrong by at most
 
               (s + sigma)^2/(r - rho) - s^2/r                 s^2/r is convex in (s, r), grows with s, falls with r:
                                                               no change is as large as that to this corner
-            + 2 sin(angle/2) |K dv + a [- a_j]|               of turning e
-            + K sigma [+ tau]
-            + k1 k2 (rho + Ds^2 (1/(r - rho) - 1/r))/2        concave and growing in r: as above, downward
+            + c |K dv + a [- a_j]|                            of turning e, with c = 2 sin(angle/2)
+            + (K + kappa) sigma [+ tau]
+            + kappa (|e.dv| + c s)
+            + (k1 k2 + pi) (rho + (Ds + eps)^2/(r - rho) - Ds^2/r)/2
+                                                              r - Ds^2/r is concave and grows in r: as above, downward
+            + pi |r - Ds^2/r|/2
 
         on either side: an active row is not measured as inactive, and a row that is kept not as violated.
         """
@@ -105,34 +121,40 @@ class SecondOrderAvoidance:
         pull = self._sum * dv
         if measurement.u is not None:
             pull = pull + measurement.u.unsqueeze(-2)
-        loose = self._sum * sigma
+        of_sum, of_product = self._gain_errors
+        chord = 2 * (angle / 2).sin()
+        loose = (self._sum + of_sum) * sigma + of_sum * (dot(dx, dv).abs() / r + chord * speed)
         if self.neighbour_acceleration == "current":
             pull, loose = pull - self._accelerations(measurement), loose + bounds.body_acceleration
-        slack = (speed + sigma).square() / nearer - speed.square() / r + 2 * (angle / 2).sin() * pull.norm(dim=-1)
-        slack = slack + loose + self._product * (rho + Ds**2 * (1 / nearer - 1 / r)) / 2
+        slack = (speed + sigma).square() / nearer - speed.square() / r + chord * pull.norm(dim=-1) + loose
+        of_distance = rho + (Ds + self.distance_error) ** 2 / nearer - Ds**2 / r
+        slack = slack + (self._product + of_product) * of_distance / 2 + of_product * (r - Ds**2 / r).abs() / 2
         slack = torch.where(clear, slack, math.inf)
         present = measurement.present
         return RowErrors(torch.where(present, angle, 0.0), torch.where(present, slack, 0.0))
 
     def slack_left_out(self, measurement: Measurement) -> Float[Tensor, "*batch"]:
-        """k1 k2 (R - Ds^2/R)/2 - K (|v| + V) - |a| [- A], the least slack of the row of a body without a slot [m/s2].
+        """k1 k2 (R - Ds^2/R)/2 - K (|v| + V) - |a| [- A], the least slack of the row of a body without a slot [m/s2],
+        over all values that K, k1 k2 and Ds may have.
 
         R is the least distance of these bodies, V their largest speed, A their largest acceleration.
         """
         left_out, a, v = measurement.left_out, measurement.u, self._velocity(measurement)
         assert left_out is not None
         assert a is not None
-        Ds = self._distance_kept(measurement, left_out.radius.unsqueeze(-1))
+        Ds = self._distance_kept(measurement, left_out.radius.unsqueeze(-1)) + self.distance_error
         largest = Ds.amax(-1) if isinstance(Ds, Tensor) and Ds.ndim > 0 else Ds
         nearest = torch.where(left_out.distance.isfinite(), left_out.distance, 1.0)
         R = (nearest * (1 - ROUND_OFF)).clamp(min=NEAREST)
         closing = v.norm(dim=-1) + left_out.speed
         if measurement.arrival_error is not None:
             closing = closing + measurement.arrival_error
-        pull = self._sum * closing + a.norm(dim=-1)
+        of_sum, of_product = self._gain_errors
+        pull = (self._sum + of_sum) * closing + a.norm(dim=-1)
         if self.neighbour_acceleration == "current":
             pull = pull + left_out.acceleration
-        away = self._product * (R - largest**2 / R) / 2
+        ahead = (R - largest**2 / R) / 2
+        away = self._product * ahead - of_product * ahead.abs()
         return away - pull - ROUND_OFF * (away.abs() + pull)
 
     def labels(self, bodies: Sequence[str]) -> list[str]:
@@ -145,6 +167,12 @@ class SecondOrderAvoidance:
     @property
     def _product(self) -> float | Tensor:
         return self.gains[0] * self.gains[1]
+
+    @property
+    def _gain_errors(self) -> tuple[float | Tensor, float | Tensor]:
+        """kappa and pi."""
+        (k1, k2), (of_1, of_2) = self.gains, self.gain_errors
+        return of_1 + of_2, k1 * of_2 + k2 * of_1 + of_1 * of_2
 
     def _distance_kept(self, measurement: Measurement, radii: Tensor | None) -> float | Tensor:
         return distance_kept(self.safety_distance, self.margin, measurement.radius, radii)
