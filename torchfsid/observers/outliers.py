@@ -1,28 +1,27 @@
-r"""Nested sets: the parameters that explain all samples, all but one, ..., all but q (q-relaxed intersections).
+r"""Nested sets: the parameters that explain all samples, all but one, ..., all but q (a q-relaxed intersection).
 
 A sample that breaks the declared model or its bounds is an outlier. Its half-spaces Omega may exclude the truth, or it
 raises the alarm, and then Omega is empty. The parameters that explain all samples but j are
 
-    T_0(t) = T_0(t-1) & Omega(t),          T_j(t) = (T_j(t-1) & Omega(t))  |  T_(j-1)(t-1),
+    T_0(t) = T_0(t-1) & Omega(t),        T_j(t) = (T_j(t-1) & Omega(t))  |  T_(j-1)(t-1),
 
 since a parameter explains the new sample, or it takes one of its j skips. The level S_j is a convex set around T_j:
 
-    S_0(t) = S_0(t-1) & Omega(t),          S_j(t) = S_j(t-1) & {theta : n.theta <= max(b, h(n)), (n, b) a row of Omega},
+    S_0(t) = S_0(t-1) & Omega(t),        S_j(t) = S_j(t-1) & {theta : n.theta <= max(b, h(n)), (n, b) a row of Omega},
 
-h the support function of S_(j-1)(t-1), -inf where that is empty. If no parameter of S_j(t-1) explains the sample, S_j(t) is
-S_(j-1)(t-1). So a gross outlier moves every level up by one, and S_0 is empty from then on.
+h the support function of S_(j-1)(t-1), -inf where that is empty. If no parameter of S_j(t-1) explains the sample,
+S_j(t) is S_(j-1)(t-1). So a gross outlier moves every level up by one, and S_0 is empty from then on.
 
-**S_j contains the truth if at most j samples are outliers.** By induction: if this sample is none, the truth stays in S_j,
-by n.theta <= b, and S_j & Omega is not empty. If it is one, at most j - 1 samples before were outliers, the truth was in
-S_(j-1), and n.theta <= h(n).
+**S_j contains the truth if at most j samples are outliers.** By induction: if this sample is none, the truth is in
+S_j & Omega, and n.theta <= b. If it is one, at most j - 1 samples before were outliers, the truth was in S_(j-1), and
+n.theta <= h(n).
 
-As long as levels 0 to k - 1 are empty, at least k samples are outliers. The rows that emptied a level contradict each other,
-so one of their samples is an outlier. It is known which one where no parameter of S_q satisfies its row.
+Where the levels 0 to k - 1 are empty, at least k samples are outliers. The rows that emptied a level contradict each
+other, so one of their samples is an outlier. If no parameter of S_q satisfies the row of a sample, it is that one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -46,9 +45,10 @@ class SetAside:
     Attributes:
         t: its time [s].
         robot: the robot.
-        sources: the rows by which it contradicts other samples, as in `critical_region` or `inverse_optimal_set`. For an
-            alarm it is the violated row.
-        is_certain: no parameter of the set explains it. Otherwise it is one of several, of which one is an outlier.
+        sources: the rows by which it contradicts other samples, as in `critical_region` or `inverse_optimal_set`. For
+            an alarm it is the violated row.
+        is_certain: whether no parameter of the set explains it. Otherwise it is one of several that contradict each
+            other, and it is open which of them is the outlier.
     """
 
     t: float

@@ -114,8 +114,8 @@ class SetMembershipObserver:
 
     Raises:
         InputError: the prior is not a batch (B,) over the task's parameters; `inverse_optimal` comes without `noise`;
-            `compiled` is True, but theta is not planar; `outliers` is negative, or comes with
-            `windows` or `reset`.
+            `compiled` is True, but theta is not planar; `outliers` is negative, or
+            comes with windows or `reset`.
     """
 
     task: Task
@@ -163,11 +163,13 @@ class SetMembershipObserver:
         t = measurement.time
         read = partial(evidence, self.model) if self._windows is None else self._windows.read
         found = read(self.feasible_set, measurement, self.compiled)
-        (*below, theta), explained = narrowed((*self._below, self.feasible_set), possible(found), t)
-        if theta.any_empty:
-            alarmed = found.alarmed & theta.is_empty
-            self._report(t, alarmed, found.slack, theta)
-            theta = theta.where(~theta.is_empty, self._instead(alarmed))
+        omega = possible(found) if self.outliers else found.omega
+        (*below, theta), explained = narrowed((*self._below, self.feasible_set), omega, t)
+        as_outliers = found.alarmed & (self.outliers > 0)  # these alarms empty a level, those beyond the q the last one
+        alarmed, lost = found.alarmed & (theta.is_empty | ~as_outliers), theta.is_empty & ~as_outliers
+        if theta.any_empty or bool(alarmed.any()):
+            self._report(t, alarmed, found.slack, lost, theta)
+            theta = theta.where(~theta.is_empty, self._instead())
         self._below, self.feasible_set = tuple(below), theta
         self.skipped = self.skipped + ~found.informative
         self.infeasible = self.infeasible + found.infeasible
@@ -181,21 +183,25 @@ class SetMembershipObserver:
         share = self._windows.used / self._windows.ended.clamp(min=1)
         return dict(zip(self.windows, share.tolist(), strict=True))
 
+    @property
+    def unexplained(self) -> Int[Tensor, "B"]:
+        """How many samples of each robot are left unexplained, at least: up to `outliers`."""
+        return sum((level.is_empty.long() for level in self._below), start=torch.zeros_like(self.status))
+
     def set_aside(self) -> list[SetAside]:
-        """The samples that are left unexplained so far, at most `outliers` per robot, robot by robot."""
+        """The samples that are left unexplained, robot by robot, in the order of time."""
         return set_aside((*self._below, self.feasible_set))
 
-    def _instead(self, alarmed: Tensor) -> FeasibleSet:
-        """The sets that replace empty ones: the sets as they were, or the prior. No alarm resets a set."""
-        return self.feasible_set if self.on_inconsistent == "hold" else self.prior.where(~alarmed, self.feasible_set)
+    def _instead(self) -> FeasibleSet:
+        """The sets that replace empty ones: the sets as they were, or the prior."""
+        return self.feasible_set if self.on_inconsistent == "hold" else self.prior
 
-    def _report(self, t: float, alarmed: Tensor, slack: Tensor, theta: FeasibleSet) -> None:
+    def _report(self, t: float, alarmed: Tensor, slack: Tensor, lost: Tensor, theta: FeasibleSet) -> None:
         """Record what went wrong for the first time, and raise the statuses, or an exception if that is asked for."""
         for robot in (alarmed & (self.status < Status.ALARM)).nonzero().flatten().tolist():
             row = int(slack[robot].argmin())
             self.events.append(Event(t, robot, Status.ALARM, ((t, row),)))
         reset = self.on_inconsistent == "reset"
-        lost = theta.is_empty & ~alarmed
         for robot in (lost & (self.status < Status.INCONSISTENT)).nonzero().flatten().tolist():
             self.events.append(Event(t, robot, Status.INCONSISTENT, contradicting(theta, robot), reset))
         self.status = torch.where(alarmed, self.status.clamp(min=Status.ALARM), self.status)
