@@ -19,6 +19,7 @@ from torchfsid.errors import FsidError, InconsistentError
 from torchfsid.identification.kkt import CASES
 from torchfsid.logs.log import Log
 from torchfsid.observers.hybrid import HybridObserver
+from torchfsid.observers.outliers import SetAside
 from torchfsid.observers.safety import SafetyObserver, SetObserver
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.outcome import Status
@@ -44,6 +45,8 @@ class Verdict:
         radius: Chebyshev radius of the set.
         no_information_since: when the set last shrank [s]. None: it never did.
         resets: times at which the set started again from the prior [s].
+        unexplained: number of samples that are left unexplained, at least: up to `outliers`.
+        set_aside: the samples that may be these.
         status: `ok`, `alarm` or `inconsistent`, see `Status`.
     """
 
@@ -58,6 +61,8 @@ class Verdict:
     radius: float
     no_information_since: float | None
     resets: tuple[float, ...]
+    unexplained: int
+    set_aside: tuple[SetAside, ...]
     status: str
 
 
@@ -145,6 +150,8 @@ class Observation:
         half = torch.full((len(self.robots),), self.bound_used / AUTO_FACTOR, dtype=torch.float64)
         suffices = self.declared.consistency().sets(half).fits
         needs_more = (sets.status == Status.OK) & ~suffices
+        if isinstance(sets, SetMembershipObserver):  # an outlier would need any bound
+            needs_more = needs_more & (sets.unexplained == 0)
         return [robot for robot, strained in zip(self.robots, needs_more.tolist(), strict=True) if strained]
 
     def run(self, out: Path, track: Track = iter) -> None:
@@ -192,6 +199,9 @@ class Observation:
         sets = self.sets.feasible_set
         centre, radius = sets.chebyshev()
         volume, diameter, centroid = sets.volume(), sets.diameter(), sets.centroid()
+        aside, unexplained = [], [0] * len(self.robots)
+        if isinstance(self.sets, SetMembershipObserver):
+            aside, unexplained = self.sets.set_aside(), self.sets.unexplained.tolist()
         return [
             Verdict(
                 robot=robot,
@@ -205,6 +215,8 @@ class Observation:
                 radius=float(radius[i]),
                 no_information_since=None if sets.last_cut[i].isnan() else float(sets.last_cut[i]),
                 resets=tuple(float(event.t) for event in self.sets.events if event.robot == i and event.reset),
+                unexplained=unexplained[i],
+                set_aside=tuple(sample for sample in aside if sample.robot == i),
                 status=STATUS_NAMES[Status(int(self.sets.status[i]))],
             )
             for i, robot in enumerate(self.robots)

@@ -39,6 +39,7 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
         shown = observation.bound.cell(verdict.status, observation.smallest_bounds is not None)
         is_doubtful = verdict.status != "ok" or observation.bound.is_useless
         resets = "".join(f", reset at {seconds(t)}" for t in verdict.resets)
+        aside = f", {verdict.unexplained} set aside" if verdict.unexplained else ""
         verdicts.add_row(
             escape(verdict.robot),
             " ".join(f"{case}:{count}" for case, count in verdict.cases.items() if count),
@@ -49,7 +50,7 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
             _point(verdict.centre, verdict),
             _size(verdict.radius),
             "never" if since is None else seconds(since),
-            (_red(shown) if is_doubtful else shown) + resets,
+            (_red(shown) if is_doubtful else shown) + resets + aside,
         )
     console.print(verdicts)
     if infeasible := [f"{verdict.robot} {verdict.infeasible}" for verdict in found if verdict.infeasible]:
@@ -68,6 +69,8 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
             )
     if observation.narrowing is not None:
         _print_lines(observation.narrowing.said(), console)
+    if observation.config.outliers:
+        _print_outliers(observation, console)
     if isinstance(observation.sets, SafetyObserver):
         _print_safety(observation.sets, observation.robots, observation.declared.row_labels, console)
     noise = observation.config.noise
@@ -107,6 +110,22 @@ def _print_events(observation: Observation, console: Console) -> None:
 def _print_lines(lines: Sequence[str], console: Console) -> None:
     for line in lines:
         console.print(escape(line), soft_wrap=True)
+
+
+def _print_outliers(observation: Observation, console: Console) -> None:
+    """Print what the sets promise, and the samples that are set aside."""
+    q, labels = observation.config.outliers, observation.declared.row_labels
+    samples = "sample is an outlier" if q == 1 else "samples are outliers"
+    console.print(f"outliers: {q}: a set holds the truth if at most {q} of its robot's {samples}")
+    for verdict in observation.verdicts():
+        for certain in (True, False):
+            if named := [
+                f"{seconds(sample.t)} ({', '.join(dict.fromkeys(constraint_name(s, labels) for s in sample.sources))})"
+                for sample in verdict.set_aside
+                if sample.is_certain == certain
+            ]:
+                what = "set aside" if certain else "set aside, but it is not certain which of these"
+                console.print(escape(f"{verdict.robot}: {what}: {', '.join(named)}"), soft_wrap=True)
 
 
 def _print_safety(observer: SafetyObserver, robots: Sequence[str], labels: Sequence[str], console: Console) -> None:
@@ -168,6 +187,9 @@ def print_hypotheses(hypotheses: Hypotheses, out: Path, console: Console) -> Non
     for name, observation in hypotheses.observations.items():
         if observation.narrowing is not None:
             _print_lines([f"{name}: {line}" for line in observation.narrowing.said()], console)
+        if observation.config.outliers:
+            console.print(f"[bold]{escape(name)}[/]: ", end="")
+            _print_outliers(observation, console)
         sets = observation.sets
         explains_some = bool((sets.status < Status.INCONSISTENT).any())
         if isinstance(sets, SafetyObserver) and sets.team_is_refuted and explains_some:

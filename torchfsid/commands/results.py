@@ -195,7 +195,8 @@ def regions(
 
     `last_cut` is NaN if the set never shrank. Sizes and centres are NaN if the set is empty. `facets` says at which
     time and from which constraint each row came (`source` as in `critical_region` and `inverse_optimal_set`, -1 for the
-    prior).
+    prior). With `outliers` q > 0 every robot has an entry of that name: q, how many samples are left unexplained at
+    least, and which (`SetAside`).
     """
     sets = observer.feasible_set
     facets, (centre, radius) = sets.facets(), sets.chebyshev()
@@ -232,6 +233,12 @@ def regions(
                 for event in events
             ],
         }
+    if isinstance(observer, SetMembershipObserver) and observer.outliers:
+        for robot, unexplained in zip(robots, observer.unexplained.tolist(), strict=True):
+            of_robots[robot]["outliers"] = {"q": observer.outliers, "at_least": unexplained, "set_aside": []}
+        for found in observer.set_aside():
+            entry = {"t": found.t, "sources": found.sources, "certain": found.is_certain}
+            of_robots[robots[found.robot]]["outliers"]["set_aside"].append(entry)
     if not isinstance(observer, SafetyObserver):
         used = {f"{length:g}": share for length, share in observer.windows_used.items()}
         return {"robots": of_robots, "windows_used": used} if used else {"robots": of_robots}

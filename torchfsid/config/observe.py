@@ -74,6 +74,7 @@ class ObserveConfig(Strict):
         obstacles: bodies of the log that are avoided but not inferred.
         on_inconsistent: what happens to a set when the intersection is empty: `hold` keeps it, `reset` starts again
             from the prior, `raise` ends the command.
+        outliers: the number of samples per robot that may be left unexplained (`observers.outliers`).
         bag: where the bodies are in a ROS bag. Other logs ignore it.
         ukf: the unscented Kalman filter that runs beside the sets, or False for none.
     """
@@ -89,6 +90,7 @@ class ObserveConfig(Strict):
     windows: Annotated[tuple[Positive, ...], Field(min_length=1)] | None = None
     obstacles: tuple[BodyName, ...] = ()
     on_inconsistent: Literal["hold", "reset", "raise"] = "hold"
+    outliers: Annotated[int, Field(strict=True, ge=0)] = 0
     bag: BagConfig | None = None
     ukf: OptionalUkfConfig = UkfConfig()
 
@@ -117,6 +119,7 @@ class ObserveConfig(Strict):
         if self.noise.control == "auto" and self.on_inconsistent == "reset":
             raise wrong("auto takes a change of goal for noise, give a number or take on_inconsistent: hold", "noise")
         self._windows_fit()
+        self._outliers_fit()
         return self
 
     def _windows_fit(self) -> None:
@@ -134,6 +137,19 @@ class ObserveConfig(Strict):
             raise wrong("a window may span a change of goal, take hold", "on_inconsistent")
         if self.noise.control == "auto":
             raise wrong("with windows it is the error of the controllers alone: expected a number", "noise.velocity")
+
+    def _outliers_fit(self) -> None:
+        if self.outliers == 0:
+            return
+        if self.velocity == "windows":
+            raise wrong("a wrong position spoils all windows that hold it, take differentiated", "outliers")
+        if self.on_inconsistent == "reset":
+            raise wrong("a change of goal would count as an outlier, take on_inconsistent: hold", "outliers")
+        if self.is_unknown or self.unknown_numbers:
+            what = "gain or distance of a barrier" if self.is_unknown else self.unknown_numbers[0].name
+            raise wrong(f"expected 0 with an unknown {what}", "outliers")
+        if self.noise.control == "auto":
+            raise wrong("auto takes an outlier for noise, give a number", "noise")
 
     @property
     def is_second_order(self) -> bool:
@@ -212,7 +228,15 @@ class ObserveConfig(Strict):
         else:
             known = [barrier for barrier in barriers if callable(barrier)]
             sets = SetMembershipObserver(
-                task, known, prior, self.set, noise, tolerance, self.on_inconsistent, windows=self.windows or ()
+                task,
+                known,
+                prior,
+                self.set,
+                noise,
+                tolerance,
+                self.on_inconsistent,
+                windows=self.windows or (),
+                outliers=self.outliers,
             )
         if self.ukf is False:
             return sets

@@ -9,6 +9,9 @@ Failures of the data are reported:
     - a hard row is violated by more than its bound: model or bounds are wrong. The sample is not used, the status is
       ALARM;
     - a sample says nothing of theta, for a reason listed in `evidence`: it is skipped and counted.
+
+With `outliers: q` up to q samples of each robot may contradict the others or be alarming (`outliers`). Theta then holds
+all parameters that explain the others, and the two failures above are those of the samples beyond the q.
 """
 
 from __future__ import annotations
@@ -26,6 +29,7 @@ from torchfsid.errors import InconsistentError, InputError
 from torchfsid.identification.evidence import Evidence, ObservationModel, SetKind, evidence
 from torchfsid.identification.kkt import KktSolution
 from torchfsid.identification.windows import Windows
+from torchfsid.observers.outliers import SetAside, narrowed, possible, set_aside
 from torchfsid.outcome import Status
 from torchfsid.robots.barriers import Barrier
 from torchfsid.robots.bounds import NoiseBound
@@ -60,7 +64,7 @@ class SetEstimate:
         t: time [s].
         feasible_set: Theta(t) of every robot.
         evidence: the evidence of this measurement alone.
-        informative: whether the sample was used.
+        informative: whether the sample was used: it has information, and some parameter of the set explains it.
         status: a `Status` per robot, the worst so far.
         safety: Psi of the team, batch (1,), or of every robot, where safety parameters are unknown (`SafetyObserver`).
     """
@@ -99,6 +103,8 @@ class SetMembershipObserver:
             `InconsistentError`.
         compiled: see `evidence`. The sets are the same up to round-off.
         windows: lengths of windows over positions [s] (`identification.windows`). None: each sample is read by itself.
+        outliers: the number of samples per robot that may be left unexplained. Theta holds the truth if no more of them
+            break the declared model or its bounds.
         model: the declared model as one record.
         prior: the initial sets.
         status: a `Status` per robot.
@@ -108,7 +114,8 @@ class SetMembershipObserver:
 
     Raises:
         InputError: the prior is not a batch (B,) over the task's parameters; `inverse_optimal` comes without `noise`;
-            `compiled` is True, but theta is not planar.
+            `compiled` is True, but theta is not planar; `outliers` is negative, or
+            comes with windows or `reset`.
     """
 
     task: Task
@@ -120,12 +127,14 @@ class SetMembershipObserver:
     on_inconsistent: OnInconsistent = "hold"
     compiled: bool | None = None
     windows: Sequence[float] = ()
+    outliers: int = 0
     model: ObservationModel = field(init=False)
     prior: FeasibleSet = field(init=False)
     status: Int[Tensor, "B"] = field(init=False)
     skipped: Int[Tensor, "B"] = field(init=False)
     infeasible: Int[Tensor, "B"] = field(init=False)
     events: list[Event] = field(init=False, default_factory=list)
+    _below: tuple[FeasibleSet, ...] = field(init=False)
 
     def __post_init__(self) -> None:
         p = len(self.task.parameter_names)
@@ -136,6 +145,10 @@ class SetMembershipObserver:
         if self.compiled and p != 2:
             raise InputError("compiled", "None or False unless theta is planar", True)
         self._windows = Windows(self.model, self.windows) if self.windows else None
+        if self.outliers < 0 or (self.outliers and (self.windows or self.on_inconsistent == "reset")):
+            expected = "0 with windows and where sets are reset" if self.outliers > 0 else "a number of samples"
+            raise InputError("outliers", expected, self.outliers)
+        self._below = (self.feasible_set,) * self.outliers
         self.prior = self.feasible_set
         self.status = torch.zeros_like(self.feasible_set.outcome)
         self.skipped = self.infeasible = torch.zeros_like(self.status)
@@ -150,16 +163,17 @@ class SetMembershipObserver:
         t = measurement.time
         read = partial(evidence, self.model) if self._windows is None else self._windows.read
         found = read(self.feasible_set, measurement, self.compiled)
-        narrowed = self.feasible_set.intersect(found.omega, t)
-        informative = found.informative
-        if narrowed.any_empty or bool(found.alarmed.any()):
-            self._report(t, found.alarmed, found.slack, narrowed)
-            informative = informative & ~narrowed.is_empty
-            narrowed = narrowed.where(~narrowed.is_empty, self._instead())
-        self.feasible_set = narrowed
+        omega = possible(found) if self.outliers else found.omega
+        (*below, theta), explained = narrowed((*self._below, self.feasible_set), omega, t)
+        as_outliers = found.alarmed & (self.outliers > 0)  # these alarms empty a level, those beyond the q the last one
+        alarmed, lost = found.alarmed & (theta.is_empty | ~as_outliers), theta.is_empty & ~as_outliers
+        if theta.any_empty or bool(alarmed.any()):
+            self._report(t, alarmed, found.slack, lost, theta)
+            theta = theta.where(~theta.is_empty, self._instead())
+        self._below, self.feasible_set = tuple(below), theta
         self.skipped = self.skipped + ~found.informative
         self.infeasible = self.infeasible + found.infeasible
-        return SetEstimate(t, self.feasible_set, found, informative, self.status)
+        return SetEstimate(t, self.feasible_set, found, found.informative & explained, self.status)
 
     @property
     def windows_used(self) -> dict[float, float]:
@@ -169,24 +183,33 @@ class SetMembershipObserver:
         share = self._windows.used / self._windows.ended.clamp(min=1)
         return dict(zip(self.windows, share.tolist(), strict=True))
 
+    @property
+    def unexplained(self) -> Int[Tensor, "B"]:
+        """How many samples of each robot are left unexplained, at least: up to `outliers`."""
+        return sum((level.is_empty.long() for level in self._below), start=torch.zeros_like(self.status))
+
+    def set_aside(self) -> list[SetAside]:
+        """The samples that are left unexplained, robot by robot, in the order of time."""
+        return set_aside((*self._below, self.feasible_set))
+
     def _instead(self) -> FeasibleSet:
         """The sets that replace empty ones: the sets as they were, or the prior."""
         return self.feasible_set if self.on_inconsistent == "hold" else self.prior
 
-    def _report(self, t: float, alarmed: Tensor, slack: Tensor, narrowed: FeasibleSet) -> None:
+    def _report(self, t: float, alarmed: Tensor, slack: Tensor, lost: Tensor, theta: FeasibleSet) -> None:
         """Record what went wrong for the first time, and raise the statuses, or an exception if that is asked for."""
         for robot in (alarmed & (self.status < Status.ALARM)).nonzero().flatten().tolist():
             row = int(slack[robot].argmin())
             self.events.append(Event(t, robot, Status.ALARM, ((t, row),)))
         reset = self.on_inconsistent == "reset"
-        for robot in (narrowed.is_empty & (self.status < Status.INCONSISTENT)).nonzero().flatten().tolist():
-            self.events.append(Event(t, robot, Status.INCONSISTENT, contradicting(narrowed, robot), reset))
+        for robot in (lost & (self.status < Status.INCONSISTENT)).nonzero().flatten().tolist():
+            self.events.append(Event(t, robot, Status.INCONSISTENT, contradicting(theta, robot), reset))
         self.status = torch.where(alarmed, self.status.clamp(min=Status.ALARM), self.status)
         if not reset:
-            self.status = torch.where(narrowed.is_empty, Status.INCONSISTENT, self.status)
-        if self.on_inconsistent == "raise" and narrowed.any_empty:
-            robot = int(narrowed.is_empty.int().argmax())
-            raise InconsistentError(robot, t, contradicting(narrowed, robot))
+            self.status = torch.where(lost, Status.INCONSISTENT, self.status)
+        if self.on_inconsistent == "raise" and bool(lost.any()):
+            robot = int(lost.int().argmax())
+            raise InconsistentError(robot, t, contradicting(theta, robot))
 
 
 def contradicting(sets: FeasibleSet, item: int) -> tuple[tuple[float, int], ...]:
