@@ -69,6 +69,7 @@ def observe_log(path: Path, models: Mapping[str, ObserveConfig], folder: Results
                     draw_safety(out)
         except (OSError, FigureError) as problem:
             problems.append(problem)
+    report.print_reading(log.reading, console())
     if isinstance(run, Hypotheses):
         try:
             run.write_verdicts(folder.path)
@@ -94,6 +95,7 @@ def check_log(path: Path, models: Mapping[str, ObserveConfig], folder: ResultsFo
             (folder.path / name).mkdir(exist_ok=True)
             write_json(folder.path / name / CHECKED, of_model.to_json())
     shown = console()
+    report.print_reading(log.reading, shown)
     for name, of_model in found.items():
         report.print_check(of_model, name, shown)
 

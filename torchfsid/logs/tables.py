@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import reprlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -12,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from torchfsid.errors import LogError, one_line
+from torchfsid.logs.reading import NEGLIGIBLE, half_units
 
 LARGEST = 1e12
 """Larger numbers are no measurements (in SI units, even stamps in seconds since 1970 are smaller)."""
@@ -47,12 +49,20 @@ class Table(Protocol):
         """
         ...
 
-    def numbers(self, column: str) -> Float[np.ndarray, "rows"]:
+    def numbers(self, column: str, may_be_empty: bool = False) -> Float[np.ndarray, "rows"]:
         """The column as numbers, none larger than `LARGEST`.
+
+        Args:
+            column: the name.
+            may_be_empty: empty cells are NaN. Otherwise they are mistakes.
 
         Raises:
             LogError: an entry is not such a number.
         """
+        ...
+
+    def rounding(self, columns: Sequence[str], values: Float[np.ndarray, "rows n"]) -> Float[np.ndarray, "rows n"]:
+        """How far the numbers of these columns, all of one quantity, can be from those that were written."""
         ...
 
 
@@ -128,17 +138,26 @@ class CsvTable:
         index = self.header.index(column)
         return checked_names(self, column, [row[index].strip() for row in self.rows])
 
-    def numbers(self, column: str) -> Float[np.ndarray, "rows"]:
-        index = self.header.index(column)
-        cells = [row[index] for row in self.rows]
+    def numbers(self, column: str, may_be_empty: bool = False) -> Float[np.ndarray, "rows"]:
+        cells = self._cells(column)
+        there = np.array([not may_be_empty or bool(cell.strip()) for cell in cells])
+        if not there.all():
+            cells = [cell if cell.strip() else "0" for cell in cells]
         try:
             values = np.fromiter(map(float, cells), dtype=np.float64, count=len(cells))
         except ValueError:
             values = np.array([math.nan])
         if is_measurable(values).all() and _is_plain("".join(cells)):
-            return values
+            return np.where(there, values, math.nan)
         i = next(i for i, cell in enumerate(cells) if not _is_number(cell))
         raise self.error(i, f"column {column!r}: expected {A_NUMBER}, got {reprlib.repr(cells[i])}")
+
+    def rounding(self, columns: Sequence[str], values: Float[np.ndarray, "rows n"]) -> Float[np.ndarray, "rows n"]:
+        return half_units((cell for column in columns for cell in self._cells(column)), values)
+
+    def _cells(self, column: str) -> list[str]:
+        index = self.header.index(column)
+        return [row[index] for row in self.rows]
 
 
 def _is_plain(text: str) -> bool:
@@ -189,18 +208,25 @@ class ParquetTable:
             raise self.header_error(f"column {column!r}: expected text or whole numbers, it holds {cells.type}")
         return checked_names(self, column, ["" if cell is None else str(cell).strip() for cell in cells.to_pylist()])
 
-    def numbers(self, column: str) -> Float[np.ndarray, "rows"]:
+    def numbers(self, column: str, may_be_empty: bool = False) -> Float[np.ndarray, "rows"]:
         from pyarrow import float64, types
 
         cells = self._column(column)
         if not (types.is_integer(cells.type) or types.is_floating(cells.type) or types.is_decimal(cells.type)):
             raise self.header_error(f"column {column!r}: expected numbers, it holds {cells.type}")
         values = cells.cast(float64(), safe=False).to_numpy(zero_copy_only=False).astype(np.float64)
-        measurable = is_measurable(values)
+        measurable = is_measurable(values) | (may_be_empty & np.isnan(values))
         if not measurable.all():
             i = int(np.argmin(measurable))
             raise self.error(i, f"column {column!r}: expected {A_NUMBER}, got {cells[i].as_py()!r}")
         return values
+
+    def rounding(self, columns: Sequence[str], values: Float[np.ndarray, "rows n"]) -> Float[np.ndarray, "rows n"]:
+        from pyarrow import float16, float32
+
+        precision = {float16(): np.float16, float32(): np.float32}
+        units = [np.finfo(precision.get(self._column(column).type, np.float64)).eps for column in columns]
+        return np.where(np.array(units) > NEGLIGIBLE, np.array(units) / 2, 0.0) * np.abs(values)
 
     def _column(self, column: str) -> Any:
         """The column as one Arrow array. A column of categories is replaced by its values."""
