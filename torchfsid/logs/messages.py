@@ -110,7 +110,7 @@ def _covariance(where: str, name: str, entries: Any) -> Float[np.ndarray, "6 6"]
     matrix = np.array(entries, dtype=np.float64).reshape(6, 6)
     if not (np.isfinite(matrix).all() and (np.diag(matrix) >= 0).all() and matrix[:2, :2].any()):
         raise LogError(
-            f"{where}: no covariance of the {name}: leave bag.covariance_multiple out, declare noise instead"
+            f"{where}: no covariance of the {name}: declare noise instead of bag.covariance_multiple"
         )
     return matrix
 
