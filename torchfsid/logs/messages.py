@@ -109,9 +109,7 @@ def _covariance(where: str, name: str, entries: Any) -> Float[np.ndarray, "6 6"]
     """A covariance as ROS writes it: 36 entries. All zeros, or a negative variance, mean that it is unknown."""
     matrix = np.array(entries, dtype=np.float64).reshape(6, 6)
     if not (np.isfinite(matrix).all() and (np.diag(matrix) >= 0).all() and matrix[:2, :2].any()):
-        raise LogError(
-            f"{where}: no covariance of the {name}: declare noise instead of bag.covariance_multiple"
-        )
+        raise LogError(f"{where}: no covariance of the {name}: declare noise instead of bag.covariance_multiple")
     return matrix
 
 

@@ -49,7 +49,9 @@ class Reading:
             yield f"Times are counted from the first sample, {self.time_origin:.9f} s"
 
 
-def half_units(texts: Iterable[str], values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+def half_units(
+    texts: Iterable[str], values: Float[np.ndarray, "*shape"], power: int = 0
+) -> Float[np.ndarray, "*shape"]:
     """How far numbers can be from those that were rounded when they were written: half a unit of the last digit.
 
     The columns of one quantity are written alike: with a fixed number of decimals D, or with a fixed number of
@@ -59,16 +61,17 @@ def half_units(texts: Iterable[str], values: Float[np.ndarray, "*shape"]) -> Flo
 
     Args:
         texts: the cells of all columns of one quantity.
-        values: their numbers, or some of them.
+        values: their numbers, or some of them, in SI units.
+        power: the power of ten by which the texts have to be multiplied for SI units. Whole are numbers in these.
     """
     decimals, digits = 0, 0
     for text in set(texts):
-        mantissa, _, power = text.strip().lower().partition("e")
+        mantissa, _, exponent = text.strip().lower().partition("e")
         whole, _, fraction = mantissa.lstrip("+-").partition(".")
         digits = max(digits, len((whole + fraction).lstrip("0")))
         if digits >= ALL_DIGITS:
             return np.zeros(values.shape)
-        decimals = max(decimals, len(fraction) - int(power or 0))
+        decimals = max(decimals, len(fraction) - int(exponent or 0) - power)
     if decimals <= 0:
         return np.zeros(values.shape)
     first = np.floor(np.log10(np.maximum(np.abs(values), 10.0**-decimals)))
