@@ -92,7 +92,7 @@ class _Content:
             if len(frames) > 1:
                 (one, here), (other, there), *_ = frames.items()
                 raise LogError(
-                    f"{self.source}: positions in different frames: {one!r} ({here}) and {other!r} ({there})"
+                    f"{self.source}: positions in different frames: {one!r} ({here}) and {other!r} ({there}); follow transforms (bag.fixed_frame)?"
                 )
         common = self.transforms.fixed if self.transforms else next(iter(frames), "")
         for topic in bag.accelerations:
