@@ -8,7 +8,7 @@ log:                                                          any other table, b
   header_line: 7
   time: "Time (Seconds)"
   unit: mm
-  bodies: {r1: {x: "r1 X", y: "r1 Y", heading: "r1 yaw"}, cf2: {file: cf2.csv, x: stateEstimate.x, y: stateEstimate.y}}
+  bodies: {r1: {x: "r1 X", y: "r1 Y"}, cf2: {file: cf2.csv, x: stateEstimate.x, y: stateEstimate.y}}
 """
 
 from __future__ import annotations
@@ -41,7 +41,6 @@ class BodyColumns(Strict):
         vx: velocity [unit of length per s].
         vy: velocity.
         vz: velocity.
-        heading: heading, counterclockwise seen from above [`angle`].
     """
 
     file: ColumnName | None = None
@@ -51,7 +50,6 @@ class BodyColumns(Strict):
     vx: ColumnName | None = None
     vy: ColumnName | None = None
     vz: ColumnName | None = None
-    heading: ColumnName | None = None
 
 
 def _name_or_columns(value: Any) -> str:
@@ -71,7 +69,6 @@ class LogConfig(Strict):
         up: vertical axis of the export. With `y` the plane is (x, -z), seen from above. Default: `y` for `optitrack`,
             otherwise `z`.
         unit: unit of length. Default: what the export says, otherwise `m`.
-        angle: unit of headings in `columns`.
         radius: radius of every body [m].
     """
 
@@ -88,7 +85,6 @@ class LogConfig(Strict):
     header_line: Annotated[int, Field(strict=True, ge=1)] = 1
     up: Literal["y", "z"] | None = None
     unit: Literal["m", "cm", "mm"] | None = None
-    angle: Literal["rad", "deg"] = "rad"
     radius: dict[BodyName, NonNegative] | None = None
 
     @property

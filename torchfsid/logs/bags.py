@@ -91,9 +91,9 @@ class _Content:
             frames = {sample.frame: origin for origin in of_one for sample in self.samples[origin]}
             if len(frames) > 1:
                 (one, here), (other, there), *_ = frames.items()
-                raise LogError(
-                    f"{self.source}: positions in different frames: {one!r} ({here}) and {other!r} ({there}); follow transforms (bag.fixed_frame)?"
-                )
+                both = f"{one!r} ({here}) and {other!r} ({there})"
+                hint = "" if self.transforms else "; do transforms join them (bag.fixed_frame)?"
+                raise LogError(f"{self.source}: positions in different frames: {both}{hint}")
         common = self.transforms.fixed if self.transforms else next(iter(frames), "")
         for topic in bag.accelerations:
             for sample in self.samples[f"topic {topic!r}"]:

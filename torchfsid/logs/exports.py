@@ -41,7 +41,6 @@ class Recorded(NamedTuple):
         stamps: time of each table row [ns].
         columns: names of columns, by axis: x, y, z, perhaps vx, vy, vz.
         power: unit of length, as a power of ten of a metre.
-        heading: the column of headings, or those of a quaternion x, y, z, w. Empty if there is none.
     """
 
     body: str
@@ -49,7 +48,6 @@ class Recorded(NamedTuple):
     stamps: Int[np.ndarray, "rows"]
     columns: dict[str, str]
     power: int
-    heading: tuple[str, ...] = ()
 
 
 def recorded(path: Path, form: LogConfig) -> list[Recorded]:
@@ -88,9 +86,8 @@ def _by_columns(path: Path, form: LogConfig) -> list[Recorded]:
         columns = {name: column for name, column in given.model_dump(exclude={"file"}).items() if column is not None}
         for column in columns.values():
             require_column(table, column)
-        heading = columns.pop("heading", None)
         power = SCALES[form.unit or "m"]
-        found.append(Recorded(body, table, stamps, columns, power, () if heading is None else (heading,)))
+        found.append(Recorded(body, table, stamps, columns, power))
     return found
 
 
@@ -119,7 +116,7 @@ def _of_tum(body: str, file: Path, form: LogConfig) -> Recorded:
         records += [Record(i + 1, cells)] if cells else []
     table = CsvTable(str(file), records)
     stamps = _stamps(table, "t", TIME_UNITS[form.time_unit])
-    return Recorded(body, table, stamps, {axis: axis for axis in "xyz"}, SCALES[form.unit or "m"], TUM_NAMES[4:])
+    return Recorded(body, table, stamps, {axis: axis for axis in "xyz"}, SCALES[form.unit or "m"])
 
 
 def _optitrack(path: Path, form: LogConfig) -> Iterator[Recorded]:
@@ -148,15 +145,14 @@ def _optitrack(path: Path, form: LogConfig) -> Iterator[Recorded]:
     if unit is None:
         raise LogError(f"{path} line 1: unknown units of length {told['Length Units']!r} (log.unit)")
     for name in dict.fromkeys(names[i] for i in range(2, width) if kinds[i] == "Rigid Body"):
-        turned = tuple(f"{name} Rotation {axis}" for axis in "XYZW")
-        heading = turned if set(turned) <= set(labels) else ()
-        yield _of(name, table, stamps, {axis: f"{name} Position {axis.upper()}" for axis in "xyz"}, unit, heading)
+        yield _of(name, table, stamps, {axis: f"{name} Position {axis.upper()}" for axis in "xyz"}, unit)
 
 
 def _vicon(path: Path, form: LogConfig) -> Iterator[Recorded]:
     records = _records(path)
     section, rate, names, header, units = (record.cells for record in [*records[:5], *[Record(0, [""])] * 5][:5])
-    if section[0] not in VICON_SECTIONS or not DECIMAL.fullmatch(rate[0]) or header[0] != "Frame":
+    has_rate = DECIMAL.fullmatch(rate[0]) and float(rate[0]) > 0
+    if section[0] not in VICON_SECTIONS or not has_rate or header[0] != "Frame":
         raise LogError(f"{path} line 1: not an export of Vicon: expected one of {', '.join(VICON_SECTIONS)}, a rate")
     labels, owner = list(header[:2]), ""
     for i, axis in enumerate(header[2:], start=2):
@@ -171,21 +167,14 @@ def _vicon(path: Path, form: LogConfig) -> Iterator[Recorded]:
     stamps, marker = _of_frames(table, labels[0], rate[0]), section[0] == "Trajectories"
     unit = form.unit or next((unit.strip() for unit in units[2:] if unit.strip() in SCALES), "mm")
     for name in dict.fromkeys(name.strip() for name in names[2:] if name.strip()):
-        heading = (f"{name} RZ",) if f"{name} RZ" in labels and "rad" in units else ()
-        yield _of(
-            name,
-            table,
-            stamps,
-            {axis: f"{name} {'' if marker else 'T'}{axis.upper()}" for axis in "xyz"},
-            unit,
-            heading,
-        )
+        columns = {axis: f"{name} {'' if marker else 'T'}{axis.upper()}" for axis in "xyz"}
+        yield _of(name, table, stamps, columns, unit)
 
 
-def _of(name: str, table: CsvTable, stamps: np.ndarray, columns: dict[str, str], unit: str, heading: tuple) -> Recorded:
+def _of(name: str, table: CsvTable, stamps: np.ndarray, columns: dict[str, str], unit: str) -> Recorded:
     for column in columns.values():
         require_column(table, column)
-    return Recorded(name, table, stamps, columns, SCALES[unit], heading)
+    return Recorded(name, table, stamps, columns, SCALES[unit])
 
 
 def _records(path: Path) -> list[Record]:
