@@ -156,6 +156,7 @@ def test_files_with_other_times_are_resampled(tmp_path):
     log = read_log(tmp_path / "runs", form=form(format="tum"))
     np.testing.assert_array_equal(log.t, [k / 100 for k in range(9)])
     assert log.reading.to_json()["time_origin"] == 1790000000
+    assert log.differentiated().reading == log.reading
     assert log.lost is not None
     assert log.lost[0].tolist() == [False, True]
 

@@ -98,7 +98,8 @@ class ResampledLog(Log):
         """The log with velocities from differences of the bodies' own samples (module docstring)."""
         assert self.clock is not None
         positions = [replace(track, u=None) for track in self.tracks]
-        return _resampled(self.source, positions, self.clock, self.radius, differentiate=True)
+        log = _resampled(self.source, positions, self.clock, self.radius, differentiate=True)
+        return replace(log, reading=self.reading)
 
     def accelerated(self, velocity_error: float) -> Log:
         """Not possible: between the times of the clock the accelerations are not held."""
