@@ -12,8 +12,8 @@ import yaml
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from torchfsid.logs.bags import ACCELERATION, ODOMETRY, POSE, TRANSFORMS
 from torchfsid.logs.log import Log, read_csv
+from torchfsid.logs.messages import ACCELERATION, ODOMETRY, POSE, TRANSFORMS
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 TYPES = STORE.types
@@ -51,15 +51,17 @@ def odometry(
     orientation: Sequence[float] = UNTURNED,
     frame: str = "world",
     child: str = "base_link",
+    covariance: np.ndarray | None = None,
 ) -> object:
-    """nav_msgs/Odometry; `twist` is in the frame `child`."""
+    """nav_msgs/Odometry; `twist` is in the frame `child`. Pose and twist have the same covariance."""
+    covariance = np.zeros(36) if covariance is None else covariance
     full_twist = TYPES["geometry_msgs/msg/Twist"](linear=_vector("Vector3", twist), angular=_vector("Vector3", (0, 0)))
     with_covariance = TYPES["geometry_msgs/msg/PoseWithCovariance"], TYPES["geometry_msgs/msg/TwistWithCovariance"]
     return TYPES[ODOMETRY](
         header=_header(stamp, frame),
         child_frame_id=child,
-        pose=with_covariance[0](pose=_pose(position, orientation), covariance=np.zeros(36)),
-        twist=with_covariance[1](twist=full_twist, covariance=np.zeros(36)),
+        pose=with_covariance[0](pose=_pose(position, orientation), covariance=covariance),
+        twist=with_covariance[1](twist=full_twist, covariance=covariance),
     )
 
 
@@ -74,7 +76,12 @@ def acceleration(stamp: int, values: Sequence[float], frame: str = "world") -> o
     return TYPES[ACCELERATION](header=_header(stamp, frame), accel=accel)
 
 
-def transforms(stamp: int, positions: Mapping[str, Sequence[float]], frame: str = "world") -> object:
+def transforms(
+    stamp: int,
+    positions: Mapping[str, Sequence[float]],
+    frame: str = "world",
+    orientation: Sequence[float] = UNTURNED,
+) -> object:
     """tf2_msgs/TFMessage of several child frames."""
     of = TYPES["geometry_msgs/msg/Transform"]
     return TYPES[TRANSFORMS](
@@ -82,7 +89,7 @@ def transforms(stamp: int, positions: Mapping[str, Sequence[float]], frame: str 
             TYPES["geometry_msgs/msg/TransformStamped"](
                 header=_header(stamp, frame),
                 child_frame_id=child,
-                transform=of(translation=_vector("Vector3", position), rotation=_quaternion(UNTURNED)),
+                transform=of(translation=_vector("Vector3", position), rotation=_quaternion(orientation)),
             )
             for child, position in positions.items()
         ]

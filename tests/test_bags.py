@@ -16,12 +16,13 @@ from torchfsid.cli import main
 from torchfsid.config.bags import BagConfig
 from torchfsid.config.documents import validate
 from torchfsid.errors import ConfigError, FsidError, LogError
-from torchfsid.logs.bags import ODOMETRY, POSE, TRANSFORMS, read_bag
+from torchfsid.logs.bags import read_bag
 from torchfsid.logs.log import Log, read_csv
+from torchfsid.logs.messages import ODOMETRY, POSE, TRANSFORMS
 from torchfsid.logs.read import read_log
 
 CSV = """t,robot,x,y,vx,vy,radius
-0,ann,-1.5,0.25,0.125,-0.5,0.2
+0,ann,-1.4999999999999998,0.25,0.12499999999999999,-0.5,0.2
 0,bob,1.1,0.3,-0.7,0.01,0.25
 0.033,ann,-1.49,0.23,0.13,-0.49,0.2
 0.033,bob,1.08,0.31,-0.69,0.02,0.25

@@ -164,7 +164,8 @@ class Observation:
             OSError: a file could not be written. The log was still observed to its end.
         """
         bound, labels = {"used": self.bound_used, **self.bound.to_json()}, self.declared.row_labels
-        with ResultsWriter(out, self.robots, self.sets, labels=labels, bound=bound) as results:
+        told = self.log.reading.to_json()
+        with ResultsWriter(out, self.robots, self.sets, labels=labels, bound=bound, log=told) as results:
             for measurement in track(self.declared.measurements()):
                 try:
                     estimate = self.observer.update(measurement)

@@ -15,6 +15,7 @@ from torchfsid.commands.judged_bound import JudgedBound
 from torchfsid.commands.observe import Observation, Verdict
 from torchfsid.commands.results import STATUS_NAMES, constraint_name, seconds
 from torchfsid.commands.terminal import digits, ends, table
+from torchfsid.logs.reading import Reading
 from torchfsid.observers.safety import SafetyObserver
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.outcome import Status
@@ -161,6 +162,12 @@ def _print_safety(observer: SafetyObserver, robots: Sequence[str], labels: Seque
     if odd := [robots[robot] for robot in observer.odd()]:
         names = odd[0] if len(odd) == 1 else f"one of {', '.join(odd)}"
         console.print(escape(f"without {names} the others can have the same parameters"))
+
+
+def print_reading(reading: Reading, console: Console) -> None:
+    """Print what was found while the log was read."""
+    for sentence in reading.sentences():
+        console.print(escape(sentence), soft_wrap=True)
 
 
 def print_hypotheses(hypotheses: Hypotheses, out: Path, console: Console) -> None:

@@ -50,6 +50,7 @@ class ResultsWriter:
         others: further observers, by the prefix of their columns.
         labels: labels of the rows of the model.
         bound: what regions.json says of the velocity bound.
+        log: what it says of the log.
     """
 
     def __init__(
@@ -60,9 +61,11 @@ class ResultsWriter:
         others: Mapping[str, SetMembershipObserver] = MappingProxyType({}),
         labels: Sequence[str] = (),
         bound: Mapping[str, object] = MappingProxyType({}),
+        log: Mapping[str, object] = MappingProxyType({}),
     ):
         self.out, self.robots, self.observer, self.others = out, list(robots), observer, others
-        self._labels, self._seen, self._bound = labels, Distances(), bound
+        self._labels, self._seen = labels, Distances()
+        self._told = {name: dict(content) for name, content in (("bound", bound), ("log", log)) if content}
         self._safety = SafetyColumns(observer) if isinstance(observer, SafetyObserver) else None
         self._described = {name: _Descriptions() for name in ("", *others)}
         self._problem: OSError | None = None
@@ -83,7 +86,7 @@ class ResultsWriter:
             self._file.close()
             try:
                 found = regions(self.robots, self.observer, self._seen, self._labels)
-                write_json(self.out / "regions.json", found | ({"bound": dict(self._bound)} if self._bound else {}))
+                write_json(self.out / "regions.json", found | self._told)
             except OSError as problem:
                 self._problem = self._problem or problem
         if self._problem is not None:

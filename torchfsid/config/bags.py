@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import reprlib
+from typing import Annotated
 
 from pydantic import Field, model_validator
 
@@ -15,18 +16,24 @@ class BagConfig(Strict):
 
     Attributes:
         topics: topic of an Odometry or PoseStamped, to the name of the body.
-        frames: child frame of a transform on /tf, to the name of the body.
+        frames: child frame of a transform on /tf, to the name of the body. With `fixed_frame` any frame of the tree.
+        fixed_frame: frame to which chains of transforms on /tf and /tf_static lead, such as map. Default: none, all
+            positions are given in the same frame.
         rate: rate [Hz] of the common clock, best the controllers' rate. It is used only if the bodies' stamps differ.
             Default: the stamps of the first body.
         accelerations: topic of an AccelStamped, to the name of the body. In the frame of the positions.
         radius: radius of every body [m].
+        covariance_multiple: number of standard deviations, from the covariances of Odometry, that bound the errors of
+            positions and velocities. Default: covariances are not used.
     """
 
     topics: dict[str, BodyName] = Field(default_factory=dict)
     frames: dict[str, BodyName] = Field(default_factory=dict)
     accelerations: dict[str, BodyName] = Field(default_factory=dict)
+    fixed_frame: Annotated[str, Field(min_length=1)] | None = None
     rate: Positive | None = None
     radius: dict[BodyName, NonNegative] | None = None
+    covariance_multiple: Positive | None = None
 
     @property
     def origins(self) -> list[tuple[str, str]]:

@@ -58,6 +58,7 @@ Config = TypeVar("Config", bound=Strict)
 
 CHOICES = frozenset(
     {"<section>", "<false>", "<number>", "<interval>", "<velocity>", "<acceleration>", "avoidance, order: 2"}
+    | {"<name>", "<columns>"}
 )
 """Tags of values of two kinds, a section or False, a number or an interval. Pydantic puts them into paths, but they are
 no keys."""

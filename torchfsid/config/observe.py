@@ -15,6 +15,7 @@ from torchfsid.config.avoidance import AvoidanceConfig
 from torchfsid.config.bags import BagConfig
 from torchfsid.config.barriers import BarrierConfig
 from torchfsid.config.documents import Strict, wrong
+from torchfsid.config.motion_capture import LogConfig
 from torchfsid.config.observers import AccelerationNoiseConfig, ObservedNoiseConfig, PriorConfig, UkfConfig
 from torchfsid.config.quantities import BodyName, Positive, require_body
 from torchfsid.config.tasks import TaskConfig
@@ -76,6 +77,7 @@ class ObserveConfig(Strict):
             from the prior, `raise` ends the command.
         outliers: the number of samples per robot that may be left unexplained (`observers.outliers`).
         bag: where the bodies are in a ROS bag. Other logs ignore it.
+        log: the form of a log of motion capture. Other logs have columns of their own.
         ukf: the unscented Kalman filter that runs beside the sets, or False for none.
     """
 
@@ -92,6 +94,7 @@ class ObserveConfig(Strict):
     on_inconsistent: Literal["hold", "reset", "raise"] = "hold"
     outliers: Annotated[int, Field(strict=True, ge=0)] = 0
     bag: BagConfig | None = None
+    log: LogConfig | None = None
     ukf: OptionalUkfConfig = UkfConfig()
 
     @model_validator(mode="after")

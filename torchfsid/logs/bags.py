@@ -1,18 +1,17 @@
 """ROS 2 bags (sqlite3 or MCAP, with or without zstd) as logs. The extra `ros` is needed, ROS itself is not.
 
-A body is measured by a topic (nav_msgs/Odometry or geometry_msgs/PoseStamped) or by a transform on /tf. Accelerations
-come from a geometry_msgs/AccelStamped in the frame of the positions. Times are the
-stamps of the headers, not the times of reception. All positions must be in one frame. The twist of an Odometry is in
-its child frame. The orientation of the pose turns it into the frame of the positions, unless both frames are the same.
+A body is measured by a topic (nav_msgs/Odometry or geometry_msgs/PoseStamped) or by a frame on /tf. Accelerations come
+from a geometry_msgs/AccelStamped in the frame of the positions. Times are the stamps of the headers, not the times of
+reception. All positions must be in one frame, or chains of transforms lead from theirs to the fixed frame
+(`transforms`). What a message means: `messages`.
 """
 
 from __future__ import annotations
 
-import math
 import reprlib
-from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int
@@ -20,15 +19,13 @@ from jaxtyping import Int
 from torchfsid.config.bags import BagConfig
 from torchfsid.errors import ConfigError, FsidError, LogError, one_line
 from torchfsid.logs.log import Log
+from torchfsid.logs.messages import ACCELERATION, ODOMETRY, POSE, TRANSFORMS, Sample, nanoseconds, sample_of
+from torchfsid.logs.motion import Motion, start_of
+from torchfsid.logs.reading import Reading
 from torchfsid.logs.resampling import Series, Track, log_of_tracks
-from torchfsid.logs.tables import A_NUMBER, is_measurable
+from torchfsid.logs.transforms import Transforms, namespaces, tf_topics
 
-ODOMETRY, POSE, TRANSFORMS = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "tf2_msgs/msg/TFMessage"
-ACCELERATION = "geometry_msgs/msg/AccelStamped"
 TF_TOPIC = "/tf"
-
-UNIT = 1e-2
-"""How far a quaternion's norm may be from 1; all zeros, the usual mistake, is no orientation."""
 
 MAX_TIMES = 1_000_000
 """More times of a clock are a slip of the pen in its rate, or in somebody's stamps."""
@@ -37,99 +34,162 @@ MAX_TIMES = 1_000_000
 def read_bag(path: str | Path, bag: BagConfig) -> Log:
     """The log in a bag: a folder with metadata.yaml, or a single .mcap or .db3 file.
 
-    Bodies whose stamps differ are resampled onto one clock, with bounds on the errors (`resampling`).
+    Bodies whose stamps differ are resampled onto one clock, with bounds on the errors (`resampling`). Stamps since 1970
+    are counted from the first.
 
     Raises:
         LogError: the file cannot be read, or is not such a bag.
         ConfigError: `bag` names a topic or frame that is not in the bag, or a topic of another type.
     """
     source = str(path)
-    samples = _read(Path(path), bag)
-    frames = {sample.frame: origin for origin, _ in bag.origins for sample in samples[origin]}
-    if len(frames) > 1:
-        (one, here), (other, there), *_ = frames.items()
-        raise LogError(f"{source}: positions in different frames: {one!r} ({here}) and {other!r} ({there})")
-    accelerations = {}
+    content = _read(Path(path), bag)
+    content.require_one_frame(bag)
+    motions = {origin: content.motion(origin) for origin, _ in bag.origins}
+    accelerations = {body: content.motion(f"topic {topic!r}") for topic, body in bag.accelerations.items()}
+    start = start_of(int(motion.stamps[0]) for motion in [*motions.values(), *accelerations.values()])
+
+    def from_start(where: str, motion: Motion) -> Motion:
+        motion = motion._replace(stamps=motion.stamps - start)
+        motion.require_numbers(f"{source}: {where}")
+        return motion
+
+    series = {}
     for topic, body in bag.accelerations.items():
-        origin = f"topic {topic!r}"
-        for sample in samples[origin]:
-            if sample.frame not in frames:
-                raise LogError(
-                    f"{source}: {origin}: accelerations in the frame {sample.frame!r}, not {next(iter(frames))!r}"
-                )
-        accelerations[body] = _series(f"{source}: {origin}", samples[origin])
-    tracks = [
-        _track(f"{source}: {origin}", body, samples[origin], accelerations.get(body)) for origin, body in bag.origins
-    ]
+        motion = from_start(f"topic {topic!r}", accelerations[body])
+        series[body] = Series(motion.stamps, motion.x[:, :2])
+    tracks = []
+    for origin, body in bag.origins:
+        motion = from_start(origin, motions[origin])
+        motion.require_level(f"{source}: {origin}")
+        tracks.append(Track.of(body, motion, series.get(body)))
     clock = None if bag.rate is None else _clock(tracks[0].stamps, bag.rate)
     radius = None if bag.radius is None else np.array([bag.radius[track.body] for track in tracks])
-    return log_of_tracks(source, tracks, clock, radius)
+    log = log_of_tracks(source, tracks, clock, radius)
+    return replace(log, reading=Reading(time_origin=start / 1_000_000_000)) if start else log
 
 
-class _Sample(NamedTuple):
-    """What one message says about a body.
+@dataclass
+class _Content:
+    """What a bag says.
 
     Attributes:
-        stamp: time of the header [ns].
-        frame: frame of the header.
-        x: position [m], or acceleration [m/s2].
-        u: velocity in the same frame [m/s], or None.
+        source: the bag, for messages.
+        samples: the samples from every topic and frame, in the order of reception.
+        transforms: all transforms, if there is a fixed frame.
+        names: the topic or frame of each entry of `samples`.
     """
 
-    stamp: int
-    frame: str
-    x: tuple[float, float]
-    u: tuple[float, float] | None
+    source: str
+    samples: dict[str, list[Sample]]
+    transforms: Transforms | None
+    names: dict[str, str]
+
+    def require_one_frame(self, bag: BagConfig) -> None:
+        """Check that positions and accelerations are in one frame. With a fixed frame, those of one topic."""
+        origins = [origin for origin, _ in bag.origins]
+        for of_one in [[origin] for origin in origins] if self.transforms else [origins]:
+            frames = {sample.frame: origin for origin in of_one for sample in self.samples[origin]}
+            if len(frames) > 1:
+                (one, here), (other, there), *_ = frames.items()
+                both = f"{one!r} ({here}) and {other!r} ({there})"
+                hint = "" if self.transforms else "; do transforms join them (bag.fixed_frame)?"
+                raise LogError(f"{self.source}: positions in different frames: {both}{hint}")
+        common = self.transforms.fixed if self.transforms else next(iter(frames), "")
+        for topic in bag.accelerations:
+            for sample in self.samples[f"topic {topic!r}"]:
+                if sample.frame != common:
+                    what = f"accelerations in the frame {sample.frame!r}, not {common!r}"
+                    raise LogError(f"{self.source}: topic {topic!r}: {what}")
+
+    def motion(self, origin: str) -> Motion:
+        """The samples from one origin in the order of time, in the fixed frame if there is one."""
+        name = self.names[origin]
+        if self.transforms is not None and origin.startswith("frame "):
+            return self.transforms.of_frame(name)
+        ordered = sorted(set(self.samples[origin]))  # messages are often repeated
+        where = f"{self.source}: {origin}"
+        if len(ordered) < 2:
+            raise LogError(f"{where}: expected at least 2 messages with different stamps, got {len(ordered)}")
+        stamps = np.array([sample.stamp for sample in ordered])
+        if (np.diff(stamps) == 0).any():
+            same = int(stamps[np.argmin(np.diff(stamps))])
+            t = (same - start_of([int(stamps[0])])) / 1_000_000_000
+            raise LogError(f"{where}: different messages have the same stamp, {t} s")
+        motion = Motion(
+            stamps,
+            np.array([sample.x for sample in ordered]),
+            None if ordered[0].u is None else np.array([sample.u for sample in ordered]),
+            np.array([sample.position_error for sample in ordered]),
+            np.array([sample.velocity_error for sample in ordered]),
+        )
+        if self.transforms is None:
+            return motion
+        return self.transforms.in_fixed(self.transforms.qualified(ordered[0].frame, name), motion, name)
 
 
-def _read(path: Path, bag: BagConfig) -> dict[str, list[_Sample]]:
-    """The samples from every topic and frame, in the order of reception."""
+def _read(path: Path, bag: BagConfig) -> _Content:
     try:
         from rosbags.rosbag2 import Reader
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise LogError(f"{path}: ROS bags need an extra: pip install 'torchfsid[ros]'") from error
-    # The three types are the same in every ROS 2, so no type definition in the bag has to be parsed.
+    # The types are the same in every ROS 2, so no type definition in the bag has to be parsed.
     decode = get_typestore(Stores.LATEST).deserialize_cdr
-    samples: dict[str, list[_Sample]] = {origin: [] for origin, _ in bag.origins}
-    samples |= {f"topic {topic!r}": [] for topic in bag.accelerations}
-    frames: set[str] = set()
+    names = {f"topic {topic!r}": topic for topic in [*bag.topics, *bag.accelerations]}
+    names |= {f"frame {frame!r}": frame.removeprefix("/") for frame in bag.frames}
+    content = _Content(str(path), {origin: [] for origin in names}, None, names)
+    there: set[str] = set()
     try:
         with Reader(path) as reader:
             types: dict[str, set[str]] = {connection.topic: set() for connection in reader.connections}
             for connection in reader.connections:
                 types[connection.topic].add(connection.msgtype)
+            if bag.fixed_frame is not None:
+                fixed = bag.fixed_frame.removeprefix("/")
+                content.transforms = Transforms(str(path), fixed, namespaces(types, TRANSFORMS))
             wanted = _wanted(path, types, bag)
-            for connection, _, content in reader.messages([c for c in reader.connections if c.topic in wanted]):
-                message: Any = decode(content, connection.msgtype)
-                if connection.msgtype == TRANSFORMS:
-                    frames.update(transform.child_frame_id for transform in message.transforms)
-                    for transform in message.transforms:
-                        if transform.child_frame_id in bag.frames:
-                            origin = f"frame {transform.child_frame_id!r}"
-                            position = transform.transform.translation
-                            samples[origin].append(_sample(f"{path}: {origin}", transform.header, position, None))
-                else:
+            for connection, _, raw in reader.messages([c for c in reader.connections if c.topic in wanted]):
+                message: Any = decode(raw, connection.msgtype)
+                if connection.msgtype != TRANSFORMS:
                     origin = f"topic {connection.topic!r}"
-                    samples[origin].append(_READ[connection.msgtype](f"{path}: {origin}", message))
+                    where, multiple = f"{path}: {origin}", bag.covariance_multiple
+                    content.samples[origin].append(sample_of(where, connection.msgtype, message, multiple))
+                elif content.transforms is not None:
+                    content.transforms.add(connection.topic, message)
+                else:
+                    there.update(transform.child_frame_id for transform in message.transforms)
+                    _add_frames(content, message, bag)
     except FsidError:
         raise
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror or one_line(error)}") from error
     except Exception as error:  # damaged bytes make the parsers raise many kinds
         raise LogError(f"{path}: not a valid ROS bag: {one_line(error)}") from error
-    if missing := bag.frames.keys() - frames:
-        there = reprlib.repr(sorted(frames))
+    if content.transforms is None and (missing := bag.frames.keys() - there):
+        known = reprlib.repr(sorted(there))
         raise ConfigError(
-            f"bag.frames: {path}: no transform on {TF_TOPIC} is called {min(missing)!r}; there are {there}"
+            f"bag.frames: {path}: no transform on {TF_TOPIC} is called {min(missing)!r}; there are {known}"
         )
-    return samples
+    return content
+
+
+def _add_frames(content: _Content, message: Any, bag: BagConfig) -> None:
+    """Take in the transforms of bodies, each as a position in its parent."""
+    for transform in message.transforms:
+        if transform.child_frame_id in bag.frames:
+            header, x = transform.header, transform.transform.translation
+            sample = Sample(nanoseconds(header.stamp), header.frame_id.removeprefix("/"), (x.x, x.y, x.z))
+            content.samples[f"frame {transform.child_frame_id!r}"].append(sample)
 
 
 def _wanted(path: Path, types: dict[str, set[str]], bag: BagConfig) -> set[str]:
     """The topics to read. Each must be in the bag and have an allowed type."""
-    expected = dict.fromkeys(bag.topics, (ODOMETRY, POSE)) | ({TF_TOPIC: (TRANSFORMS,)} if bag.frames else {})
+    expected: dict[str, tuple[str, ...]] = dict.fromkeys(bag.topics, (ODOMETRY, POSE))
     expected |= dict.fromkeys(bag.accelerations, (ACCELERATION,))
+    if bag.fixed_frame is not None:
+        expected |= dict.fromkeys(tf_topics(types, TRANSFORMS), (TRANSFORMS,))
+    elif bag.frames:
+        expected |= {TF_TOPIC: (TRANSFORMS,)}
     for topic, allowed in expected.items():
         if topic not in types:
             raise ConfigError(f"bag: {path}: no topic is called {topic!r}; there are {reprlib.repr(sorted(types))}")
@@ -137,74 +197,6 @@ def _wanted(path: Path, types: dict[str, set[str]], bag: BagConfig) -> set[str]:
             got = " and ".join(map(repr, sorted(types[topic])))
             raise ConfigError(f"bag: {path}: topic {topic!r} is of type {got}, expected {' or '.join(allowed)}")
     return set(expected)
-
-
-def _of_pose(where: str, message: Any) -> _Sample:
-    return _sample(where, message.header, message.pose.position, None)
-
-
-def _of_acceleration(where: str, message: Any) -> _Sample:
-    return _sample(where, message.header, message.accel.linear, None)
-
-
-def _of_odometry(where: str, message: Any) -> _Sample:
-    pose, twist = message.pose.pose, message.twist.twist.linear
-    velocity = twist.x, twist.y, twist.z
-    if message.child_frame_id != message.header.frame_id:
-        q = pose.orientation
-        if not abs(math.hypot(q.w, q.x, q.y, q.z) - 1) <= UNIT:
-            raise LogError(f"{where}: expected a unit quaternion, got {(q.x, q.y, q.z, q.w)}")
-        velocity = _rotated((q.w, q.x, q.y, q.z), velocity)
-    return _sample(where, message.header, pose.position, velocity[:2])
-
-
-_READ = {ODOMETRY: _of_odometry, POSE: _of_pose, ACCELERATION: _of_acceleration}
-
-
-def _sample(where: str, header: Any, position: Any, velocity: tuple[float, ...] | None) -> _Sample:
-    values = position.x, position.y, *(velocity or ())
-    stamp = header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
-    if not is_measurable(values).all():
-        raise LogError(f"{where}: expected {A_NUMBER} everywhere, got {values} at t = {stamp / 1_000_000_000} s")
-    u = None if velocity is None else (values[2], values[3])
-    return _Sample(stamp, header.frame_id.removeprefix("/"), (values[0], values[1]), u)
-
-
-def _rotated(quaternion: tuple[float, ...], vector: tuple[float, ...]) -> tuple[float, ...]:
-    """The vector v turned by the quaternion (w, q): v + w t + q x t, with t = 2 (q x v) / norm^2.
-
-    The norm of the quaternion may differ slightly from 1.
-    """
-    w, *axis = quaternion
-    twice = [2 / sum(q * q for q in quaternion) * c for c in _cross(axis, vector)]
-    return tuple(v + w * t + c for v, t, c in zip(vector, twice, _cross(axis, twice), strict=True))
-
-
-def _cross(a: Sequence[float], b: Sequence[float]) -> tuple[float, float, float]:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-def _track(where: str, body: str, samples: Sequence[_Sample], acceleration: Series | None) -> Track:
-    stamps, x, u = _in_order(where, samples)
-    return Track(body, stamps, x, u, acceleration)
-
-
-def _series(where: str, samples: Sequence[_Sample]) -> Series:
-    stamps, values, _ = _in_order(where, samples)
-    return Series(stamps, values)
-
-
-def _in_order(where: str, samples: Sequence[_Sample]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Stamps, positions and velocities."""
-    ordered = sorted(set(samples))  # transforms are often repeated
-    if len(ordered) < 2:
-        raise LogError(f"{where}: expected at least 2 messages with different stamps, got {len(ordered)}")
-    stamps = np.array([sample.stamp for sample in ordered])
-    if (np.diff(stamps) == 0).any():
-        t = stamps[np.argmin(np.diff(stamps))] / 1_000_000_000
-        raise LogError(f"{where}: different messages have the same stamp, {t} s")
-    u = None if ordered[0].u is None else np.array([sample.u for sample in ordered])
-    return stamps, np.array([sample.x for sample in ordered]), u
 
 
 def _clock(stamps: Int[np.ndarray, "samples"], rate: float) -> Int[np.ndarray, "times"]:

@@ -15,8 +15,11 @@ body in the log, in place of v,
 Proof: x - x_true = (1 - l) (x(s) - x_true) + l (x(s + h) - x_true), and x_true is at most l h v away from x(s) and (1 -
 l) h v from x(s + h). The same holds for u.
 
-A body that is seen at s but not at the next sample has no velocity from differences of positions. Its velocity is then
-0 with an error of v as well, while its position is exact.
+A body that is seen at s but not at the next sample has no velocity from differences of positions, and the cells of a
+logged velocity may be empty. It is then 0 with an error of v as well, while the position is that of the sample.
+
+Errors of the samples are interpolated and added, with the same weights as the samples. Where the velocity of a robot
+that is driven by accelerations is unknown at one end of a gap, it is unknown in the gap.
 
 A row of such a body is an ordinary row with wider bounds. It is left out where it is provably inactive. It counts as
 active in every direction where the body may be anywhere around the robot. The sample says nothing about the missing
@@ -48,31 +51,35 @@ def bridged(log: Log) -> Log:
 
     def between(values: np.ndarray) -> np.ndarray:
         filled = values.copy()
-        filled[k, j] = (1 - part[:, None]) * values[before, j] + part[:, None] * values[after, j]
+        weight = part if values.ndim == 2 else part[:, None]
+        filled[k, j] = (1 - weight) * values[before, j] + weight * values[after, j]
         return filled
 
     def in_gaps(error: np.ndarray | float, declared: np.ndarray | None) -> np.ndarray:
         errors = np.zeros(gap.shape)
         errors[k, j] = error
-        return errors if declared is None else declared + errors
+        return errors if declared is None else between(declared) + errors
 
-    fastest, weight = _fastest(log.t, log.x, log.seen, log.u, log.velocity_known), 2 * part * (1 - part) * h
+    fastest, spread = _fastest(log.t, log.x, log.seen, log.u, log.velocity_known), 2 * part * (1 - part) * h
     filled = replace(
         log,
         x=between(log.x),
         seen=log.seen | gap,
         velocity_known=log.velocity_known | gap | unknown,
-        position_error=in_gaps(weight * fastest, log.position_error) if gap.any() else log.position_error,
+        position_error=in_gaps(spread * fastest, log.position_error) if gap.any() else log.position_error,
         velocity_error=in_gaps(fastest, log.velocity_error) + fastest * unknown,
         bridged=gap | unknown,
     )
     if log.a is None or log.acceleration_known is None or log.u is None:
         return filled
+    torn = np.zeros_like(gap)
+    torn[k, j] = ~(log.velocity_known[before, j] & log.velocity_known[after, j])
     strongest = _fastest(log.t, log.u, log.velocity_known, log.a, log.acceleration_known)
     return replace(
         filled,
         u=between(log.u),
-        velocity_error=in_gaps(weight * strongest, log.velocity_error),
+        velocity_known=filled.velocity_known & ~torn,
+        velocity_error=in_gaps(spread * strongest, log.velocity_error),
         acceleration_known=log.acceleration_known | gap,
         acceleration_error=in_gaps(strongest, log.acceleration_error),
     )

@@ -4,11 +4,14 @@ A table (CSV, Parquet) has one table row per body and time. The table rows of on
 increase. Other columns are ignored.
 
     t, robot, x, y[, z][, vx, vy[, vz]][, ax, ay[, az]][, radius]          [s], a name, [m], [m/s], [m/s2], [m]
+    [, position_error][, velocity_error][, acceleration_error]     bounds on the errors of this row, in the same units
 
 (vx, vy) is the control computed at t from the positions at t. It is held until the next sample t_+ (zero-order hold).
 If it was not logged, it is exactly (x(t_+) - x(t)) / (t_+ - t). Of robots that are driven by accelerations, (vx, vy) is
-the velocity at t, and (ax, ay) the control. If that was not logged, it is exactly (v(t_+) - v(t)) / (t_+ - t). A body
-without a table row at t is not there at t. If it has table rows before and after, see `gaps`.
+the velocity at t, and (ax, ay) the control. If that was not logged, it is exactly (v(t_+) - v(t)) / (t_+ - t). Where
+the cells of a velocity or an acceleration are empty, it is unknown. A table row that repeats another one exactly is
+left out. Numbers that were rounded when the log was written are wrong by up to half a unit per axis, which is added to
+the bounds. A body without a table row at t is not there at t. If it has table rows before and after, see `gaps`.
 
 PyTorch is imported only when the measurements are asked for, so that a wrong log is refused at once.
 """
@@ -17,7 +20,7 @@ from __future__ import annotations
 
 import reprlib
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,15 +28,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from torchfsid.errors import LogError
+from torchfsid.logs.quantities import quantities_in, radii_in, times_in
+from torchfsid.logs.reading import UNITS, Reading
 from torchfsid.logs.tables import CsvTable, ParquetTable, Table, require_column
 
 if TYPE_CHECKING:
     from torchfsid.robots.measurement import Measurement
-
-
-LONGEST_STEP = 1e4
-"""Median time between samples above which times are in another unit [s]: nobody records a motion every three hours, and
-stamps in nanoseconds of up to 100 kHz, or in microseconds of up to 100 Hz, are further apart than this."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,7 @@ class Log:
         lost: the body is there at t but its position is unknown. None means that a body that is not seen is not there.
         bridged: the body was not measured at t, and its position is interpolated (see `gaps`). It is then not observed
             itself.
+        reading: what was found while the log was read.
     """
 
     source: str
@@ -74,6 +75,7 @@ class Log:
     a: Float[np.ndarray, "times bodies n"] | None = None
     acceleration_known: Bool[np.ndarray, "times bodies"] | None = None
     acceleration_error: Float[np.ndarray, "times bodies"] | None = None
+    reading: Reading = field(default_factory=Reading)
 
     @property
     def controls(self) -> tuple[Float[np.ndarray, "times bodies n"] | None, Bool[np.ndarray, "times bodies"]]:
@@ -94,14 +96,25 @@ class Log:
     def differentiated(self) -> Log:
         """The log with velocities from differences of its positions (module docstring), without its last time.
 
-        The velocity of a body that is missing from the next sample is unknown.
+        The velocity of a body that is missing from the next sample is unknown. Positions that are wrong by e and e_+
+        make a velocity wrong by at most (e + e_+) / (t_+ - t).
 
         Raises:
             LogError: a difference quotient is not finite.
         """
         known = self.seen[:-1] & self.seen[1:]
         u = self._quotients(self.x, known, "velocities")
-        return replace(self, t=self.t[:-1], x=self.x[:-1], u=u, seen=self.seen[:-1], velocity_known=known)
+        error = self.position_error
+        return replace(
+            self,
+            t=self.t[:-1],
+            x=self.x[:-1],
+            u=u,
+            seen=self.seen[:-1],
+            velocity_known=known,
+            position_error=None if error is None else error[:-1],
+            velocity_error=None if error is None else (error[:-1] + error[1:]) / np.diff(self.t)[:, None],
+        )
 
     def windowed(self, position_error: float) -> Log:
         """`differentiated`, with bounds on the errors of these velocities, (rho + rho_+) / (t_+ - t).
@@ -137,6 +150,7 @@ class Log:
             u=self.u[:-1],
             seen=self.seen[:-1],
             velocity_known=self.velocity_known[:-1],
+            position_error=None if self.position_error is None else self.position_error[:-1],
             velocity_error=None if self.velocity_error is None else self.velocity_error[:-1],
             a=self._quotients(self.u, known, "accelerations"),
             acceleration_known=known,
@@ -257,63 +271,57 @@ def _log_in(table: Table) -> Log:
     velocities = [f"v{axis}" for axis in "xyz" if f"v{axis}" in table.header]
     accelerations = [f"a{axis}" for axis in axes]
     accelerations = accelerations if set(accelerations) <= set(table.header) else []
-    for name in ["t", "robot", *axes, *(f"v{axis}" for axis in axes if velocities), *accelerations]:
+    errors = [f"{name}_error" for name in UNITS if f"{name}_error" in table.header]
+    velocities = [f"v{axis}" for axis in axes] if velocities else []
+    for name in ["t", "robot", *axes, *velocities, *accelerations, *errors]:
         require_column(table, name)
-    if "z" not in axes and "vz" in velocities:
+    if "z" not in axes and "vz" in table.header:
         raise table.header_error("column 'vz' without 'z'")
 
-    t = table.numbers("t")
-    steps = np.diff(t)
-    if (steps < 0).any():
-        i = int(np.argmax(steps < 0))
-        raise table.error(i + 1, f"times must not decrease, got {t[i + 1]} after {t[i]}")
-    if not (steps > 0).any():
-        raise table.error(len(t) - 1, f"the log ends after a single time, t = {t[0]}")
-    step = float(np.median(steps[steps > 0]))
-    if step > LONGEST_STEP:
-        raise table.header_error(f"column 't': the median step is {step:g} s; stamps in nanoseconds? Expected seconds")
-    time = np.concatenate([[0], np.cumsum(steps > 0)])
-
+    t = times_in(table)
+    time = np.concatenate([[0], np.cumsum(np.diff(t) > 0)])
     names = table.names("robot")
     bodies = tuple(dict.fromkeys(names))
     slot = {name: j for j, name in enumerate(bodies)}
     body = np.fromiter((slot[name] for name in names), dtype=np.int64, count=len(names))
-    cell = time * len(bodies) + body
-    order = np.argsort(cell, kind="stable")
-    repeats = np.flatnonzero(np.diff(cell[order]) == 0)
-    if len(repeats):
-        i = int(order[repeats + 1].min())
+    quantities = quantities_in(table, {"position": axes, "velocity": velocities, "acceleration": accelerations})
+    place = time * len(bodies) + body
+    order = np.argsort(place, kind="stable")
+    first, again = (order[:-1], order[1:])
+    repeats = np.flatnonzero(place[first] == place[again])
+    first, again = first[repeats], again[repeats]
+    same = np.all([quantity.equal(first, again) for quantity in quantities.values()], axis=0)
+    if not same.all():
+        i = int(again[~same].min())
         raise table.error(i, f"robot {names[i]!r} has another row at t = {t[i]}")
 
-    def by_time_and_body(columns: list[str]) -> np.ndarray:
-        values = np.zeros((time[-1] + 1, len(bodies), len(columns)))
-        values[time, body] = np.stack([table.numbers(column) for column in columns], axis=-1)
+    def by_time_and_body(of_rows: np.ndarray) -> np.ndarray:
+        values = np.zeros((time[-1] + 1, len(bodies), *of_rows.shape[1:]), dtype=of_rows.dtype)
+        values[time, body] = of_rows
         return values
 
-    seen = np.zeros((time[-1] + 1, len(bodies)), dtype=bool)
-    seen[time, body] = True
+    def bounds(quantity: str) -> np.ndarray | None:
+        found = quantities.get(quantity)
+        return None if found is None or not found.error.any() else by_time_and_body(found.error)
+
+    positions, u, a = (quantities.get(quantity) for quantity in UNITS)
+    assert positions is not None
+    seen = by_time_and_body(positions.known)
     return Log(
         source=table.source,
         bodies=bodies,
-        t=t[np.concatenate([[True], steps > 0])],
-        x=by_time_and_body(axes),
-        u=by_time_and_body(velocities) if velocities else None,
+        t=np.unique(t),
+        x=by_time_and_body(positions.values),
+        u=None if u is None else by_time_and_body(u.values),
         seen=seen,
-        velocity_known=seen if velocities else np.zeros_like(seen),
-        a=by_time_and_body(accelerations) if accelerations else None,
-        acceleration_known=seen if accelerations else None,
-        radius=_radius(table, names, body) if "radius" in table.header else None,
+        velocity_known=np.zeros_like(seen) if u is None else by_time_and_body(u.known),
+        radius=radii_in(table, names, body) if "radius" in table.header else None,
+        position_error=bounds("position"),
+        velocity_error=bounds("velocity"),
+        a=None if a is None else by_time_and_body(a.values),
+        acceleration_known=None if a is None else by_time_and_body(a.known),
+        acceleration_error=bounds("acceleration"),
+        reading=Reading(
+            rounding={name: of.rounding for name, of in quantities.items() if of.rounding > 0}, duplicates=len(repeats)
+        ),
     )
-
-
-def _radius(table: Table, names: list[str], body: np.ndarray) -> Float[np.ndarray, "bodies"]:
-    values = table.numbers("radius")
-    if (values < 0).any():
-        i = int(np.argmax(values < 0))
-        raise table.error(i, f"column 'radius': expected a number >= 0, got {values[i]}")
-    radius = values[np.unique(body, return_index=True)[1]]
-    changed = values != radius[body]
-    if changed.any():
-        i = int(np.argmax(changed))
-        raise table.error(i, f"the radius of robot {names[i]!r} changes from {radius[body[i]]} to {values[i]}")
-    return radius

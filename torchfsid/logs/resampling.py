@@ -10,6 +10,9 @@ interval and the two beside it: from one sample to the next, and from a sample t
 The bound on u also assumes that u changes no faster than V / h. As in every log, (vx, vy) at t is the command for the
 positions at t, and these change continuously even where a command is held. Both errors are zero at samples.
 
+Bounds on the errors of the samples are interpolated with the same weights and added. A mean velocity is wrong by (e_k +
+e_{k+1}) / h, with e_k the bounds for the positions.
+
 Accelerations have samples of their own. They are interpolated like u, with V the largest change from one of their
 samples to the next.
 
@@ -32,6 +35,7 @@ from jaxtyping import Bool, Float, Int
 
 from torchfsid.errors import LogError
 from torchfsid.logs.log import Log
+from torchfsid.logs.motion import Motion
 
 MAX_GAP = 2.5
 """Median periods that a body's samples may lie apart to be joined: one message may be lost, not two."""
@@ -58,6 +62,8 @@ class Track:
         x: positions [m].
         u: velocities [m/s], or None if not measured.
         acceleration: accelerations, or None if not measured.
+        position_error: bounds on the errors of x [m]. None means zero.
+        velocity_error: bounds on the errors of u [m/s]. None means zero.
     """
 
     body: str
@@ -65,6 +71,15 @@ class Track:
     x: Float[np.ndarray, "samples 2"]
     u: Float[np.ndarray, "samples 2"] | None
     acceleration: Series | None = None
+    position_error: Float[np.ndarray, "samples"] | None = None
+    velocity_error: Float[np.ndarray, "samples"] | None = None
+
+    @classmethod
+    def of(cls, body: str, motion: Motion, acceleration: Series | None = None) -> Track:
+        """The motion of a body in the plane."""
+        u = None if motion.u is None else motion.u[:, :2]
+        errors = [error if error.any() else None for error in (motion.position_error, motion.velocity_error)]
+        return cls(body, motion.stamps, motion.x[:, :2], u, acceleration, *errors)
 
 
 @dataclass(frozen=True)
@@ -83,7 +98,8 @@ class ResampledLog(Log):
         """The log with velocities from differences of the bodies' own samples (module docstring)."""
         assert self.clock is not None
         positions = [replace(track, u=None) for track in self.tracks]
-        return _resampled(self.source, positions, self.clock, self.radius, differentiate=True)
+        log = _resampled(self.source, positions, self.clock, self.radius, differentiate=True)
+        return replace(log, reading=self.reading)
 
     def accelerated(self, velocity_error: float) -> Log:
         """Not possible: between the times of the clock the accelerations are not held."""
@@ -132,7 +148,16 @@ def log_of_tracks(
         radius=radius,
         a=np.stack(a, axis=1) if any(accelerated) else None,
         acceleration_known=seen & np.array(accelerated) if any(accelerated) else None,
+        position_error=_stacked([track.position_error for track in tracks], len(seen)),
+        velocity_error=_stacked([track.velocity_error for track in tracks], len(seen)),
     )
+
+
+def _stacked(errors: Sequence[np.ndarray | None], samples: int) -> Float[np.ndarray, "samples bodies"] | None:
+    """The bounds of all tracks. None if no track has any."""
+    if all(error is None for error in errors):
+        return None
+    return np.stack([np.zeros(samples) if error is None else error for error in errors], axis=1)
 
 
 def seconds(stamps: Int[np.ndarray, "times"]) -> Float[np.ndarray, "times"]:
@@ -208,19 +233,27 @@ def _sample(track: Track, clock: Int[np.ndarray, "times"], differentiate: bool) 
         mean = (1 - after)[:, None] * values[interval] + after[:, None] * values[interval + 1]
         return np.where(known[:, None], mean, 0.0)
 
+    def errors_at_clock(errors: np.ndarray | None) -> np.ndarray:
+        return np.zeros(len(clock)) if errors is None else at_clock(errors[:, None], seen)[:, 0]
+
     if differentiate:
         known = (after >= 0) & (after < 1) & np.isfinite(change[interval])
         u, u_error = np.where(known[:, None], _mean_velocities(track)[interval], 0.0), bound
+        if track.position_error is not None:
+            u_error = bound + (track.position_error[:-1] + track.position_error[1:])[interval] / (
+                periods[interval] * 1e-9
+            )
     else:
         known = seen if track.u is not None else np.zeros_like(seen)
         u = np.zeros((len(clock), 2)) if track.u is None else at_clock(track.u, known)
-        u_error = 2 * weight * bound
+        u_error = 2 * weight * bound + errors_at_clock(track.velocity_error)
     return _Samples(
         x=at_clock(track.x, seen),
         u=u,
         seen=seen,
         velocity_known=known,
-        position_error=np.where(joined, weight * periods[interval] * 1e-9 * bound, 0.0),
+        position_error=np.where(joined, weight * periods[interval] * 1e-9 * bound, 0.0)
+        + errors_at_clock(track.position_error),
         velocity_error=np.where(known, u_error, 0.0),
         **_accelerations(track.acceleration, clock),
     )
