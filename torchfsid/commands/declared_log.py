@@ -6,13 +6,16 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
+from jaxtyping import Float
 
 from torchfsid.commands.judged_bound import SUSPECTS, JudgedBound
 from torchfsid.config.observe import ObserveConfig
 from torchfsid.config.unknown_numbers import replaced
 from torchfsid.errors import ConfigError
+from torchfsid.logs.contacts import arrival_errors
 from torchfsid.logs.gaps import bridged
 from torchfsid.logs.log import Log
 from torchfsid.observers.consistency import Consistency
@@ -116,7 +119,21 @@ class DeclaredLog:
 
     def measurements(self) -> Iterator[Measurement]:
         """The samples of the robots, in the order of time."""
-        return self.log.measurements(self.robots, self.config.neighbour_velocities, self.config.required)
+        uses, required = self.config.neighbour_velocities, self.config.required
+        return self.log.measurements(self.robots, uses, required, self._arrival_errors)
+
+    @property
+    def contacts(self) -> int:
+        """The number of samples at which a body did not move as its velocity says, where rows use that velocity."""
+        return 0 if self._arrival_errors is None else int((self._arrival_errors > 0).sum())
+
+    @cached_property
+    def _arrival_errors(self) -> Float[np.ndarray, "times bodies"] | None:
+        config = self.config
+        if config.is_second_order or config.velocity != "logged" or "previous" not in config.neighbour_velocities:
+            return None
+        velocity = 0.0 if config.noise.control == "auto" else config.noise.control
+        return arrival_errors(self.log, config.noise.position, velocity)
 
     def consistency(self) -> Consistency:
         """What the log says about the bound on controls, under the model and all other declared bounds."""

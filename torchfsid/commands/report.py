@@ -59,6 +59,11 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
             f"Rows may have been infeasible, and the controller took the least violation (of {len(observation.log.t)} "
             f"samples): {escape(', '.join(infeasible))}. These samples are not used."
         )
+    if observation.declared.contacts:
+        console.print(
+            f"{observation.declared.contacts} times a body did not move as its logged velocity says (contacts, perhaps, "
+            "or another time step): the velocity it arrived with counts as uncertain."
+        )
     _print_events(observation, console)
     if isinstance(observation.sets, SetMembershipObserver) and observation.sets.windows_used:
         shares = ", ".join(f"{length:g} s {share:.0%}" for length, share in observation.sets.windows_used.items())

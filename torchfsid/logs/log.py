@@ -167,7 +167,11 @@ class Log:
         return found
 
     def measurements(
-        self, robots: Sequence[str], neighbour_velocities: Collection[str], required: Collection[str] = ()
+        self,
+        robots: Sequence[str],
+        neighbour_velocities: Collection[str],
+        required: Collection[str] = (),
+        arrival_errors: Float[np.ndarray, "times bodies"] | None = None,
     ) -> Iterator[Measurement]:
         """One measurement per time, of the batch of these robots among all bodies.
 
@@ -182,6 +186,8 @@ class Log:
             neighbour_velocities: what the barriers use. `current` needs the control of every body that is there.
                 `previous` needs the same one sample earlier, the robot's own included.
             required: bodies without which a measurement says nothing, such as the leader of a formation.
+            arrival_errors: how far velocities on arrival at the next sample may be from those logged (`contacts`)
+                [m/s].
 
         Raises:
             LogError: the log has no velocities, or no body of that name.
@@ -204,8 +210,12 @@ class Log:
         if self.bridged is not None:
             observed &= ~self.bridged[:, index]
         neighbour_error = self.velocity_error
-        if neighbour_error is not None and "previous" in neighbour_velocities:  # one bound for both times
-            neighbour_error = np.maximum(neighbour_error, _one_earlier(neighbour_error))
+        if "previous" in neighbour_velocities:  # one bound for both times
+            if neighbour_error is not None:
+                neighbour_error = np.maximum(neighbour_error, _one_earlier(neighbour_error))
+            if arrival_errors is not None and arrival_errors.any():
+                pushed = _one_earlier(arrival_errors)
+                neighbour_error = pushed if neighbour_error is None else neighbour_error + pushed
         return self._measurements(self.u, index, observed, neighbour_error)
 
     def _measurements(
