@@ -63,9 +63,11 @@ def odometry(
     )
 
 
-def pose(stamp: int, position: Sequence[float], frame: str = "world") -> object:
+def pose(
+    stamp: int, position: Sequence[float], frame: str = "world", orientation: Sequence[float] = UNTURNED
+) -> object:
     """geometry_msgs/PoseStamped."""
-    return TYPES[POSE](header=_header(stamp, frame), pose=_pose(position, UNTURNED))
+    return TYPES[POSE](header=_header(stamp, frame), pose=_pose(position, orientation))
 
 
 def acceleration(stamp: int, values: Sequence[float], frame: str = "world") -> object:
@@ -74,7 +76,12 @@ def acceleration(stamp: int, values: Sequence[float], frame: str = "world") -> o
     return TYPES[ACCELERATION](header=_header(stamp, frame), accel=accel)
 
 
-def transforms(stamp: int, positions: Mapping[str, Sequence[float]], frame: str = "world") -> object:
+def transforms(
+    stamp: int,
+    positions: Mapping[str, Sequence[float]],
+    frame: str = "world",
+    orientation: Sequence[float] = UNTURNED,
+) -> object:
     """tf2_msgs/TFMessage of several child frames."""
     of = TYPES["geometry_msgs/msg/Transform"]
     return TYPES[TRANSFORMS](
@@ -82,7 +89,7 @@ def transforms(stamp: int, positions: Mapping[str, Sequence[float]], frame: str 
             TYPES["geometry_msgs/msg/TransformStamped"](
                 header=_header(stamp, frame),
                 child_frame_id=child,
-                transform=of(translation=_vector("Vector3", position), rotation=_quaternion(UNTURNED)),
+                transform=of(translation=_vector("Vector3", position), rotation=_quaternion(orientation)),
             )
             for child, position in positions.items()
         ]

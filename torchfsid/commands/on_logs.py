@@ -21,6 +21,7 @@ from torchfsid.config.documents import dump
 from torchfsid.config.models import dump_models
 from torchfsid.config.observe import ObserveConfig
 from torchfsid.errors import FigureError
+from torchfsid.logs.log import Log
 from torchfsid.logs.read import read_log
 
 FILES = ("estimates.csv", "regions.json", "regions.png", "regions.pdf")
@@ -38,7 +39,7 @@ def observe_log(path: Path, models: Mapping[str, ObserveConfig], folder: Results
     A file that cannot be written or drawn is reported at the end, after everything else is done.
     """
     use_one_thread()
-    log = read_log(path, next(iter(models.values())).bag)
+    log = _read(path, models)
     run = _ready({name: DeclaredLog(model, log) for name, model in models.items()})
     of_each = run.observations if isinstance(run, Hypotheses) else {"": run}
     files = [f"{name}/{file}" if name else file for name in of_each for file in ("config.yaml", *FILES, *UNKNOWN_FILES)]
@@ -84,7 +85,7 @@ def observe_log(path: Path, models: Mapping[str, ObserveConfig], folder: Results
 def check_log(path: Path, models: Mapping[str, ObserveConfig], folder: ResultsFolder | None) -> None:
     """`torchfsid check`: does a log fit its declared model, or each of the hypotheses?"""
     use_one_thread()
-    log = read_log(path, next(iter(models.values())).bag)
+    log = _read(path, models)
     declared = {name: DeclaredLog(model, log) for name, model in models.items()}
     with status("Checking", computes=True):
         found = {name: check(model) for name, model in declared.items()}
@@ -96,6 +97,11 @@ def check_log(path: Path, models: Mapping[str, ObserveConfig], folder: ResultsFo
     shown = console()
     for name, of_model in found.items():
         report.print_check(of_model, name, shown)
+
+
+def _read(path: Path, models: Mapping[str, ObserveConfig]) -> Log:
+    first = next(iter(models.values()))
+    return read_log(path, first.bag, None if first.body is None else first.body.heading)
 
 
 def _ready(models: Mapping[str, DeclaredLog]) -> Observation | Hypotheses:

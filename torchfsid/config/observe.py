@@ -14,6 +14,7 @@ from pydantic import Discriminator, Field, Tag, model_validator
 from torchfsid.config.avoidance import AvoidanceConfig
 from torchfsid.config.bags import BagConfig
 from torchfsid.config.barriers import BarrierConfig
+from torchfsid.config.bodies import UnicycleConfig
 from torchfsid.config.documents import Strict, wrong
 from torchfsid.config.observers import AccelerationNoiseConfig, ObservedNoiseConfig, PriorConfig, UkfConfig
 from torchfsid.config.quantities import BodyName, Positive, require_body
@@ -71,11 +72,13 @@ class ObserveConfig(Strict):
             of positions, accelerations from those of velocities. `windows` reads means over windows of positions, whose
             errors are `noise.position`. `noise.velocity` is then the error of the controllers alone.
         windows: lengths of these windows [s]. Default: those of 0.1, 0.25, 0.5 and 1 s that have two samples or more.
+        body: unicycles, whose commands are recovered from their poses. Default: robots that move as commanded.
         obstacles: bodies of the log that are avoided but not inferred.
         on_inconsistent: what happens to a set when the intersection is empty: `hold` keeps it, `reset` starts again
             from the prior, `raise` ends the command.
         bag: where the bodies are in a ROS bag. Other logs ignore it.
-        ukf: the unscented Kalman filter that runs beside the sets, or False for none.
+        ukf: the unscented Kalman filter that runs beside the sets, or False for none. It is left out with the map
+            `si_to_uni`, since positions then do not follow the commands.
     """
 
     task: TaskConfig
@@ -87,6 +90,7 @@ class ObserveConfig(Strict):
     dynamics: Dynamics = "single_integrator"
     velocity: Literal["logged", "differentiated", "windows"] = "logged"
     windows: Annotated[tuple[Positive, ...], Field(min_length=1)] | None = None
+    body: UnicycleConfig | None = None
     obstacles: tuple[BodyName, ...] = ()
     on_inconsistent: Literal["hold", "reset", "raise"] = "hold"
     bag: BagConfig | None = None
@@ -98,6 +102,7 @@ class ObserveConfig(Strict):
         if got != expected:
             raise wrong(f"task '{self.task.kind}' has {expected} parameters, lower and upper have {got}", "prior")
         require_one_order(self.dynamics, self.task, self.barriers, self.noise)
+        self._require_poses()
         unknown = [i for i, barrier in enumerate(self.barriers) if barrier.is_unknown]
         if len(unknown) > 1:
             raise wrong("one barrier may have unknown parameters, and another one has", f"barriers[{unknown[1]}]")
@@ -134,6 +139,21 @@ class ObserveConfig(Strict):
             raise wrong("a window may span a change of goal, take hold", "on_inconsistent")
         if self.noise.control == "auto":
             raise wrong("with windows it is the error of the controllers alone: expected a number", "noise.velocity")
+
+    def _require_poses(self) -> None:
+        """Check, in a validator, that a body fits the rest, and that there is one if a bound on headings is given."""
+        if self.body is None:
+            if getattr(self.noise, "heading", 0.0):
+                raise wrong(
+                    "robots have headings only with a body, e.g. {kind: unicycle, map: si_to_uni}", "noise.heading"
+                )
+            return
+        if self.is_second_order:
+            raise wrong("unicycles are driven by velocities, expected dynamics: single_integrator", "body")
+        if self.velocity != "differentiated":
+            raise wrong(
+                f"commands of unicycles come from poses: expected 'differentiated', got {self.velocity!r}", "velocity"
+            )
 
     @property
     def is_second_order(self) -> bool:
@@ -214,7 +234,7 @@ class ObserveConfig(Strict):
             sets = SetMembershipObserver(
                 task, known, prior, self.set, noise, tolerance, self.on_inconsistent, windows=self.windows or ()
             )
-        if self.ukf is False:
+        if self.ukf is False or (self.body is not None and self.body.map == "si_to_uni"):
             return sets
         ukf = self.ukf.build(task, known, self.prior, robots, self.active_tolerance)
         return HybridObserver(sets, ukf, feedback=self.ukf.feedback)

@@ -30,21 +30,29 @@ TF_TOPIC = "/tf"
 UNIT = 1e-2
 """How far a quaternion's norm may be from 1; all zeros, the usual mistake, is no orientation."""
 
+TILTED = 0.5
+"""Sine of the angle between the plane and a body's x-axis beyond which its direction in the plane says nothing."""
+
 MAX_TIMES = 1_000_000
 """More times of a clock are a slip of the pen in its rate, or in somebody's stamps."""
 
 
-def read_bag(path: str | Path, bag: BagConfig) -> Log:
+def read_bag(path: str | Path, bag: BagConfig, with_headings: bool = False) -> Log:
     """The log in a bag: a folder with metadata.yaml, or a single .mcap or .db3 file.
 
     Bodies whose stamps differ are resampled onto one clock, with bounds on the errors (`resampling`).
+
+    Args:
+        path: the folder or file.
+        bag: where the bodies are.
+        with_headings: read the orientations of the poses, too.
 
     Raises:
         LogError: the file cannot be read, or is not such a bag.
         ConfigError: `bag` names a topic or frame that is not in the bag, or a topic of another type.
     """
     source = str(path)
-    samples = _read(Path(path), bag)
+    samples = _read(Path(path), bag, with_headings)
     frames = {sample.frame: origin for origin, _ in bag.origins for sample in samples[origin]}
     if len(frames) > 1:
         (one, here), (other, there), *_ = frames.items()
@@ -59,7 +67,8 @@ def read_bag(path: str | Path, bag: BagConfig) -> Log:
                 )
         accelerations[body] = _series(f"{source}: {origin}", samples[origin])
     tracks = [
-        _track(f"{source}: {origin}", body, samples[origin], accelerations.get(body)) for origin, body in bag.origins
+        _track(f"{source}: {origin}", body, samples[origin], accelerations.get(body), with_headings)
+        for origin, body in bag.origins
     ]
     clock = None if bag.rate is None else _clock(tracks[0].stamps, bag.rate)
     radius = None if bag.radius is None else np.array([bag.radius[track.body] for track in tracks])
@@ -74,15 +83,17 @@ class _Sample(NamedTuple):
         frame: frame of the header.
         x: position [m], or acceleration [m/s2].
         u: velocity in the same frame [m/s], or None.
+        heading: direction of the body's x-axis [rad], NaN if it has none. Zero if headings were not asked for.
     """
 
     stamp: int
     frame: str
     x: tuple[float, float]
     u: tuple[float, float] | None
+    heading: float = 0.0
 
 
-def _read(path: Path, bag: BagConfig) -> dict[str, list[_Sample]]:
+def _read(path: Path, bag: BagConfig, with_headings: bool) -> dict[str, list[_Sample]]:
     """The samples from every topic and frame, in the order of reception."""
     try:
         from rosbags.rosbag2 import Reader
@@ -94,6 +105,7 @@ def _read(path: Path, bag: BagConfig) -> dict[str, list[_Sample]]:
     samples: dict[str, list[_Sample]] = {origin: [] for origin, _ in bag.origins}
     samples |= {f"topic {topic!r}": [] for topic in bag.accelerations}
     frames: set[str] = set()
+    heading_of = _heading if with_headings else lambda orientation: 0.0
     try:
         with Reader(path) as reader:
             types: dict[str, set[str]] = {connection.topic: set() for connection in reader.connections}
@@ -107,11 +119,16 @@ def _read(path: Path, bag: BagConfig) -> dict[str, list[_Sample]]:
                     for transform in message.transforms:
                         if transform.child_frame_id in bag.frames:
                             origin = f"frame {transform.child_frame_id!r}"
-                            position = transform.transform.translation
-                            samples[origin].append(_sample(f"{path}: {origin}", transform.header, position, None))
+                            place = transform.transform
+                            sample = _sample(f"{path}: {origin}", transform.header, place.translation, None)
+                            samples[origin].append(sample._replace(heading=heading_of(place.rotation)))
                 else:
                     origin = f"topic {connection.topic!r}"
-                    samples[origin].append(_READ[connection.msgtype](f"{path}: {origin}", message))
+                    sample = _READ[connection.msgtype](f"{path}: {origin}", message)
+                    if connection.topic in bag.topics:
+                        pose = message.pose if connection.msgtype == POSE else message.pose.pose
+                        sample = sample._replace(heading=heading_of(pose.orientation))
+                    samples[origin].append(sample)
     except FsidError:
         raise
     except OSError as error:
@@ -170,6 +187,15 @@ def _sample(where: str, header: Any, position: Any, velocity: tuple[float, ...] 
     return _Sample(stamp, header.frame_id.removeprefix("/"), (values[0], values[1]), u)
 
 
+def _heading(orientation: Any) -> float:
+    """The direction of the body's x-axis in the plane [rad]. NaN without an orientation, or if that axis is steep."""
+    w, x, y, z = orientation.w, orientation.x, orientation.y, orientation.z
+    if not abs(math.hypot(w, x, y, z) - 1) <= UNIT:
+        return math.nan
+    ahead = _rotated((w, x, y, z), (1.0, 0.0, 0.0))
+    return math.atan2(ahead[1], ahead[0]) if abs(ahead[2]) <= TILTED else math.nan
+
+
 def _rotated(quaternion: tuple[float, ...], vector: tuple[float, ...]) -> tuple[float, ...]:
     """The vector v turned by the quaternion (w, q): v + w t + q x t, with t = 2 (q x v) / norm^2.
 
@@ -184,18 +210,20 @@ def _cross(a: Sequence[float], b: Sequence[float]) -> tuple[float, float, float]
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-def _track(where: str, body: str, samples: Sequence[_Sample], acceleration: Series | None) -> Track:
-    stamps, x, u = _in_order(where, samples)
-    return Track(body, stamps, x, u, acceleration)
+def _track(
+    where: str, body: str, samples: Sequence[_Sample], acceleration: Series | None, with_headings: bool
+) -> Track:
+    stamps, x, u, heading = _in_order(where, samples)
+    return Track(body, stamps, x, u, acceleration, heading if with_headings else None)
 
 
 def _series(where: str, samples: Sequence[_Sample]) -> Series:
-    stamps, values, _ = _in_order(where, samples)
+    stamps, values, _, _ = _in_order(where, samples)
     return Series(stamps, values)
 
 
-def _in_order(where: str, samples: Sequence[_Sample]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Stamps, positions and velocities."""
+def _in_order(where: str, samples: Sequence[_Sample]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray]:
+    """Stamps, positions, velocities and headings."""
     ordered = sorted(set(samples))  # transforms are often repeated
     if len(ordered) < 2:
         raise LogError(f"{where}: expected at least 2 messages with different stamps, got {len(ordered)}")
@@ -204,7 +232,7 @@ def _in_order(where: str, samples: Sequence[_Sample]) -> tuple[np.ndarray, np.nd
         t = stamps[np.argmin(np.diff(stamps))] / 1_000_000_000
         raise LogError(f"{where}: different messages have the same stamp, {t} s")
     u = None if ordered[0].u is None else np.array([sample.u for sample in ordered])
-    return stamps, np.array([sample.x for sample in ordered]), u
+    return stamps, np.array([sample.x for sample in ordered]), u, np.array([sample.heading for sample in ordered])
 
 
 def _clock(stamps: Int[np.ndarray, "samples"], rate: float) -> Int[np.ndarray, "times"]:

@@ -5,6 +5,8 @@ increase. Other columns are ignored.
 
     t, robot, x, y[, z][, vx, vy[, vz]][, ax, ay[, az]][, radius]          [s], a name, [m], [m/s], [m/s2], [m]
 
+Headings of unicycles [rad] are in a column of any name, and empty for other bodies.
+
 (vx, vy) is the control computed at t from the positions at t. It is held until the next sample t_+ (zero-order hold).
 If it was not logged, it is exactly (x(t_+) - x(t)) / (t_+ - t). Of robots that are driven by accelerations, (vx, vy) is
 the velocity at t, and (ax, ay) the control. If that was not logged, it is exactly (v(t_+) - v(t)) / (t_+ - t). A body
@@ -57,6 +59,8 @@ class Log:
         lost: the body is there at t but its position is unknown. None means that a body that is not seen is not there.
         bridged: the body was not measured at t, and its position is interpolated (see `gaps`). It is then not observed
             itself.
+        heading: headings of unicycles [rad], or None if they were not asked for.
+        oriented: the body is there at t and its heading is known. None if headings were not asked for.
     """
 
     source: str
@@ -74,6 +78,15 @@ class Log:
     a: Float[np.ndarray, "times bodies n"] | None = None
     acceleration_known: Bool[np.ndarray, "times bodies"] | None = None
     acceleration_error: Float[np.ndarray, "times bodies"] | None = None
+    heading: Float[np.ndarray, "times bodies"] | None = None
+    oriented: Bool[np.ndarray, "times bodies"] | None = None
+
+    @property
+    def with_headings(self) -> tuple[str, ...]:
+        """The bodies of which some heading is known."""
+        if self.oriented is None:
+            return ()
+        return tuple(body for j, body in enumerate(self.bodies) if self.oriented[:, j].any())
 
     @property
     def controls(self) -> tuple[Float[np.ndarray, "times bodies n"] | None, Bool[np.ndarray, "times bodies"]]:
@@ -234,31 +247,43 @@ def _one_earlier(values: np.ndarray) -> np.ndarray:
     return np.concatenate([np.zeros_like(values[:1]), values[:-1]])
 
 
-def read_csv(path: str | Path) -> Log:
+def read_csv(path: str | Path, heading: str | None = None) -> Log:
     """The log in a CSV file (UTF-8, one header line).
+
+    Args:
+        path: the file.
+        heading: the column of headings, if they are wanted.
 
     Raises:
         LogError: the file cannot be read, or is not such a log. The message names the line and the column.
     """
-    return _log_in(CsvTable(str(path)))
+    return _log_in(CsvTable(str(path)), heading)
 
 
-def read_parquet(path: str | Path) -> Log:
+def read_parquet(path: str | Path, heading: str | None = None) -> Log:
     """The log in a Parquet file with the same columns. Needs the extra `parquet`.
+
+    Args:
+        path: the file.
+        heading: the column of headings, if they are wanted.
 
     Raises:
         LogError: the file cannot be read, or is not such a log. The message names the table row and the column.
     """
-    return _log_in(ParquetTable(str(path)))
+    return _log_in(ParquetTable(str(path)), heading)
 
 
-def _log_in(table: Table) -> Log:
+def _log_in(table: Table, heading: str | None) -> Log:
     axes = [axis for axis in "xyz" if axis in "xy" or axis in table.header]
     velocities = [f"v{axis}" for axis in "xyz" if f"v{axis}" in table.header]
     accelerations = [f"a{axis}" for axis in axes]
     accelerations = accelerations if set(accelerations) <= set(table.header) else []
     for name in ["t", "robot", *axes, *(f"v{axis}" for axis in axes if velocities), *accelerations]:
         require_column(table, name)
+    if heading is not None and table.header.count(heading) != 1:
+        raise table.header_error(
+            f"body.heading: expected one column {heading!r}, the header has {reprlib.repr(table.header)}"
+        )
     if "z" not in axes and "vz" in velocities:
         raise table.header_error("column 'vz' without 'z'")
 
@@ -285,6 +310,12 @@ def _log_in(table: Table) -> Log:
         i = int(order[repeats + 1].min())
         raise table.error(i, f"robot {names[i]!r} has another row at t = {t[i]}")
 
+    oriented, headings = None, None
+    if heading is not None:
+        of_rows = table.numbers(heading, may_be_empty=True)
+        oriented, headings = np.zeros((time[-1] + 1, len(bodies)), dtype=bool), np.zeros((time[-1] + 1, len(bodies)))
+        oriented[time, body], headings[time, body] = ~np.isnan(of_rows), np.nan_to_num(of_rows)
+
     def by_time_and_body(columns: list[str]) -> np.ndarray:
         values = np.zeros((time[-1] + 1, len(bodies), len(columns)))
         values[time, body] = np.stack([table.numbers(column) for column in columns], axis=-1)
@@ -303,6 +334,8 @@ def _log_in(table: Table) -> Log:
         a=by_time_and_body(accelerations) if accelerations else None,
         acceleration_known=seen if accelerations else None,
         radius=_radius(table, names, body) if "radius" in table.header else None,
+        heading=headings,
+        oriented=oriented,
     )
 
 

@@ -10,12 +10,13 @@ from torchfsid.logs.bags import read_bag
 from torchfsid.logs.log import Log, read_csv, read_parquet
 
 
-def read_log(path: str | Path, bag: BagConfig | None = None) -> Log:
+def read_log(path: str | Path, bag: BagConfig | None = None, heading: str | None = None) -> Log:
     """The log at `path`: a rosbag2 folder, .mcap, .db3 or .parquet. Any other suffix is read as CSV.
 
     Args:
         path: the file or folder.
         bag: where the bodies are in a ROS bag. Other logs ignore it.
+        heading: the column of headings, if they are wanted. Bags have the orientations of the poses instead.
 
     Raises:
         LogError: it cannot be read, or is not what its suffix says.
@@ -29,5 +30,5 @@ def read_log(path: str | Path, bag: BagConfig | None = None) -> Log:
     if is_folder or suffix in (".mcap", ".db3"):
         if bag is None:
             raise ConfigError("bag: required to read a ROS bag, e.g. bag: {topics: {/r1/odom: r1, /r2/odom: r2}}")
-        return read_bag(path, bag)
-    return read_parquet(path) if suffix == ".parquet" else read_csv(path)
+        return read_bag(path, bag, with_headings=heading is not None)
+    return read_parquet(path, heading) if suffix == ".parquet" else read_csv(path, heading)

@@ -47,8 +47,8 @@ class Table(Protocol):
         """
         ...
 
-    def numbers(self, column: str) -> Float[np.ndarray, "rows"]:
-        """The column as numbers, none larger than `LARGEST`.
+    def numbers(self, column: str, may_be_empty: bool = False) -> Float[np.ndarray, "rows"]:
+        """The column as numbers, none larger than `LARGEST`. If cells may be empty, those are NaN.
 
         Raises:
             LogError: an entry is not such a number.
@@ -128,9 +128,15 @@ class CsvTable:
         index = self.header.index(column)
         return checked_names(self, column, [row[index].strip() for row in self.rows])
 
-    def numbers(self, column: str) -> Float[np.ndarray, "rows"]:
+    def numbers(self, column: str, may_be_empty: bool = False) -> Float[np.ndarray, "rows"]:
         index = self.header.index(column)
         cells = [row[index] for row in self.rows]
+        if may_be_empty and (empty := [not cell.strip() for cell in cells]).count(True):
+            cells = ["0" if is_empty else cell for is_empty, cell in zip(empty, cells, strict=True)]
+            return np.where(empty, math.nan, self._as_numbers(column, cells))
+        return self._as_numbers(column, cells)
+
+    def _as_numbers(self, column: str, cells: list[str]) -> Float[np.ndarray, "rows"]:
         try:
             values = np.fromiter(map(float, cells), dtype=np.float64, count=len(cells))
         except ValueError:
@@ -189,7 +195,7 @@ class ParquetTable:
             raise self.header_error(f"column {column!r}: expected text or whole numbers, it holds {cells.type}")
         return checked_names(self, column, ["" if cell is None else str(cell).strip() for cell in cells.to_pylist()])
 
-    def numbers(self, column: str) -> Float[np.ndarray, "rows"]:
+    def numbers(self, column: str, may_be_empty: bool = False) -> Float[np.ndarray, "rows"]:
         from pyarrow import float64, types
 
         cells = self._column(column)
@@ -197,6 +203,8 @@ class ParquetTable:
             raise self.header_error(f"column {column!r}: expected numbers, it holds {cells.type}")
         values = cells.cast(float64(), safe=False).to_numpy(zero_copy_only=False).astype(np.float64)
         measurable = is_measurable(values)
+        if may_be_empty:
+            measurable |= cells.is_null().to_numpy(zero_copy_only=False)
         if not measurable.all():
             i = int(np.argmin(measurable))
             raise self.error(i, f"column {column!r}: expected {A_NUMBER}, got {cells[i].as_py()!r}")
