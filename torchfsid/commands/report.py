@@ -59,6 +59,8 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
             f"Rows may have been infeasible, and the controller took the least violation (of {len(observation.log.t)} "
             f"samples): {escape(', '.join(infeasible))}. These samples are not used."
         )
+    if observation.declared.recovery is not None:
+        _print_lines([observation.declared.recovery.sentence()], console)
     _print_events(observation, console)
     if isinstance(observation.sets, SetMembershipObserver) and observation.sets.windows_used:
         shares = ", ".join(f"{length:g} s {share:.0%}" for length, share in observation.sets.windows_used.items())
@@ -201,7 +203,10 @@ def print_hypotheses(hypotheses: Hypotheses, out: Path, console: Console) -> Non
         explains_some = bool((sets.status < Status.INCONSISTENT).any())
         if isinstance(sets, SafetyObserver) and sets.team_is_refuted and explains_some:
             console.print(escape(f"{name}: the robots have no safety parameters in common, each has its own"))
-    quantity = next(iter(hypotheses.observations.values())).config.noise.quantity
+    first = next(iter(hypotheses.observations.values()))
+    if first.declared.recovery is not None:
+        _print_lines([first.declared.recovery.sentence()], console)
+    quantity = first.config.noise.quantity
     _print_bound(console, hypotheses.smallest_bounds, hypotheses.bound, quantity)
     console.print(escape(f"Results: {out}/hypotheses.json, and a folder for each of {', '.join(names)}"))
 
