@@ -13,15 +13,15 @@ from torchfsid.logs.motion_capture import read_motion_capture
 
 
 def read_log(
-    path: str | Path, bag: BagConfig | None = None, form: LogConfig | None = None, heading: str | None = None
+    path: str | Path, bag: BagConfig | None = None, heading: str | None = None, form: LogConfig | None = None
 ) -> Log:
     """The log at `path`: a rosbag2 folder, .mcap, .db3 or .parquet. Any other suffix is read as CSV.
 
     Args:
         path: the file or folder.
         bag: where the bodies are in a ROS bag. Other logs ignore it.
-        form: the form of a log of motion capture. None: the suffix decides.
         heading: the column of headings, if they are wanted. Bags and motion capture have orientations instead.
+        form: the form of a log of motion capture. None: the suffix decides.
 
     Raises:
         LogError: it cannot be read, or is not what its suffix says.
