@@ -16,7 +16,8 @@ Proof: x - x_true = (1 - l) (x(s) - x_true) + l (x(s + h) - x_true), and x_true 
 l) h v from x(s + h). The same holds for u.
 
 A body that is seen at s but not at the next sample has no velocity from differences of positions. Its velocity is then
-0 with an error of v as well, while its position is exact.
+0 with an error of v as well, while its position is exact. Commands of unicycles that poses do not show stay unknown:
+they may be larger than all others.
 
 A row of such a body is an ordinary row with wider bounds. It is left out where it is provably inactive. It counts as
 active in every direction where the body may be anywhere around the robot. The sample says nothing about the missing
@@ -38,7 +39,8 @@ def bridged(log: Log) -> Log:
     later = np.minimum.accumulate(np.where(log.seen, np.arange(len(log.t))[:, None], len(log.t))[::-1], axis=0)[::-1]
     gap = ~log.seen & (earlier >= 0) & (later < len(log.t))
     goes_on = np.arange(len(log.t))[:, None] < earlier[-1]
-    unknown = log.seen & ~log.velocity_known & goes_on & (log.u is not None and log.a is None)
+    leaves = log.seen & ~np.concatenate([log.seen[1:], log.seen[-1:]])
+    unknown = leaves & ~log.velocity_known & goes_on & (log.u is not None and log.a is None)
     if log.lost is not None or not (gap | unknown).any():
         return log
     k, j = np.nonzero(gap)

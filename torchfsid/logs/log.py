@@ -281,9 +281,7 @@ def _log_in(table: Table, heading: str | None) -> Log:
     for name in ["t", "robot", *axes, *(f"v{axis}" for axis in axes if velocities), *accelerations]:
         require_column(table, name)
     if heading is not None and table.header.count(heading) != 1:
-        raise table.header_error(
-            f"body.heading: expected one column {heading!r}, the header has {reprlib.repr(table.header)}"
-        )
+        raise table.header_error(f"body.heading: no single {heading!r} in the header {reprlib.repr(table.header)}")
     if "z" not in axes and "vz" in velocities:
         raise table.header_error("column 'vz' without 'z'")
 
