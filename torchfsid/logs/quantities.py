@@ -63,8 +63,7 @@ def headings_in(table: Table, column: str) -> Float[np.ndarray, "rows"]:
         LogError: there is no such column, or a cell is not a number.
     """
     if table.header.count(column) != 1:
-        header = reprlib.repr(table.header)
-        raise table.header_error(f"body.heading: expected one column {column!r}, the header has {header}")
+        raise table.header_error(f"body.heading: no single {column!r} in the header {reprlib.repr(table.header)}")
     return table.numbers(column, may_be_empty=True)
 
 
