@@ -92,7 +92,7 @@ def test_hypotheses_say_what_they_leave_unexplained(
     [
         ("on_inconsistent=reset", "outliers: a change of goal would count as an outlier"),
         ("barriers.0.class_k.gain=[1, 200]", "outliers: expected 0 with an unknown gain or distance of a barrier"),
-        ("task.gain=[0.1, 0.2]", "outliers: expected 0 with an unknown gain of the task"),
+        ("task.gain=[0.1, 0.2]", "outliers: expected 0 with an unknown task.gain"),
         ("velocity=windows", "outliers: a wrong position spoils all windows that hold it"),
         ("noise.velocity=auto", "noise: auto takes an outlier for noise"),
     ],
