@@ -65,9 +65,11 @@ def odometry(
     )
 
 
-def pose(stamp: int, position: Sequence[float], frame: str = "world") -> object:
+def pose(
+    stamp: int, position: Sequence[float], frame: str = "world", orientation: Sequence[float] = UNTURNED
+) -> object:
     """geometry_msgs/PoseStamped."""
-    return TYPES[POSE](header=_header(stamp, frame), pose=_pose(position, UNTURNED))
+    return TYPES[POSE](header=_header(stamp, frame), pose=_pose(position, orientation))
 
 
 def acceleration(stamp: int, values: Sequence[float], frame: str = "world") -> object:

@@ -71,6 +71,16 @@ def test_a_chain_with_a_static_link_at_its_end(tmp_path):
     assert within_bounds(camera, beside)
 
 
+def test_headings_turn_with_the_frames(tmp_path):
+    """The robot points 0.5 rad to the left of odom's x-axis, which turns in the map."""
+    sent = [link(k, "odom", "base_link", driven(k * 1e-3), 0.5) for k in range(0, 1001, 50)]
+    path = write_bag(tmp_path / "bag", {"/tf": [*sent, *corrections()]})
+    log = read_bag(path, BagConfig(frames={"base_link": "r"}, fixed_frame="map"), with_headings=True)
+    assert log.heading is not None
+    expected = [0.5 + correction(t)[1] for t in np.arange(0, 1.01, 0.05)]
+    np.testing.assert_allclose(log.heading[:, 0], expected, atol=1e-5)
+
+
 def test_odometry_seen_from_the_map(tmp_path):
     """Positions and twists of an Odometry in odom; before the first and after the last correction nothing is known."""
     sent = [odometry(k * MS, driven(k * 1e-3).tolist(), (0.4, 0.0), frame="odom") for k in range(0, 1501, 50)]

@@ -19,6 +19,7 @@ from torchfsid.commands.declared_log import AUTO_FACTOR, LARGEST_OF, DeclaredLog
 from torchfsid.commands.judged_bound import SUSPECTS, JudgedBound
 from torchfsid.commands.narrowing import Narrowing, narrowed
 from torchfsid.commands.results import constraint_name, seconds
+from torchfsid.logs.commanded import Recovery
 from torchfsid.observers.consistency import Consistency, Fit
 
 SHIFTS = (-2, -1, 1, 2)
@@ -95,6 +96,8 @@ class Check:
             is not below that without a shift.
         safety: what the log says about gain and safety distance. None where that is not asked.
         narrowing: what is left of the unknown numbers at the declared bound. All else holds for what is left.
+        as_commanded: velocities are differences of positions, and taken for commands.
+        recovery: how the commands of unicycles were recovered. None if robots are none.
     """
 
     robots: tuple[RobotCheck, ...]
@@ -105,6 +108,8 @@ class Check:
     bound: JudgedBound
     shifts: dict[int, float]
     safety: SafetyCheck | None
+    as_commanded: bool
+    recovery: Recovery | None
     narrowing: Narrowing | None = None
 
     @property
@@ -126,7 +131,8 @@ class Check:
     def conclusions(self) -> list[str]:
         """The conclusions as sentences, with remedies."""
         silent = [robot.robot for robot in self.robots if robot.samples == 0]
-        lines = [f"nothing can be said of {', '.join(silent)}: no sample could be used"] if silent else []
+        lines = [] if self.recovery is None else [self.recovery.sentence()]
+        lines += [f"nothing can be said of {', '.join(silent)}: no sample could be used"] if silent else []
         if len(silent) == len(self.robots):
             return lines
         lines += [] if self.narrowing is None else self.narrowing.said()
@@ -144,6 +150,11 @@ class Check:
             lines.append(f"{controls} and positions are aligned: no shift by 1 or 2 samples fits better")
         if self.bound.is_useless and not self._unexplained:
             lines.append(self.bound.warning(is_needed=self.bound.bound <= AUTO_FACTOR * self.smallest_bound))
+        if self.as_commanded and (self.bound.is_useless or self._unexplained):
+            lines.append(
+                "velocities are differences of positions, which are no commands where robots cannot move sideways: if "
+                "they are unicycles, log their headings and declare the body"
+            )
         for name, faults in (
             ("unexplained samples", [fault for robot in self.robots for fault in robot.contradictions]),
             ("samples that violate a hard row", [f for robot in self.robots for f in robot.violations if not f.soft]),
@@ -254,7 +265,21 @@ def check(declared: DeclaredLog) -> Check:
             )
         )
     is_auto, safety = noise.control == "auto", check_safety(declared)
-    return Check(tuple(robots), noise.quantity, bound, is_auto, fastest, judged, shifts, safety, narrowing)
+    config = declared.config
+    as_commanded = config.velocity == "differentiated" and config.body is None and not config.is_second_order
+    return Check(
+        robots=tuple(robots),
+        quantity=noise.quantity,
+        declared=bound,
+        is_auto=is_auto,
+        fastest=fastest,
+        bound=judged,
+        shifts=shifts,
+        safety=safety,
+        as_commanded=as_commanded,
+        recovery=declared.recovery,
+        narrowing=narrowing,
+    )
 
 
 class _Faults:

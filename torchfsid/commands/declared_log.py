@@ -15,6 +15,7 @@ from torchfsid.commands.judged_bound import SUSPECTS, JudgedBound
 from torchfsid.config.observe import ObserveConfig
 from torchfsid.config.unknown_numbers import replaced
 from torchfsid.errors import ConfigError
+from torchfsid.logs.commanded import Recovery, commanded
 from torchfsid.logs.contacts import arrival_errors
 from torchfsid.logs.gaps import bridged
 from torchfsid.logs.log import Log
@@ -51,6 +52,8 @@ class DeclaredLog:
     Attributes:
         config: the configuration.
         log: the log, with gaps filled (`gaps`), and with velocities from differences of positions if `config` says so.
+            Those of unicycles are commands (`commanded`).
+        recovery: what became of the poses of unicycles. None if robots are none.
         robots: the bodies to infer.
         task: the task of the model.
         barriers: the barriers of the model.
@@ -62,6 +65,7 @@ class DeclaredLog:
 
     config: ObserveConfig
     log: Log
+    recovery: Recovery | None = field(init=False, default=None)
     robots: list[str] = field(init=False)
     task: Task = field(init=False)
     barriers: list[Barrier | UnknownAvoidance] = field(init=False)
@@ -85,6 +89,11 @@ class DeclaredLog:
             if config.velocity == "windows":
                 self.log = self.log.windowed(config.noise.position)
                 self.config = config.model_copy(update={"windows": config.windows or default_windows(self.log)})
+            elif config.body is not None:
+                self._require_headings()
+                self.log, self.recovery = commanded(
+                    self.log, config.body, config.noise.position, getattr(config.noise, "heading", 0.0)
+                )
             elif config.velocity == "differentiated":
                 self.log = self.log.differentiated()
         self.log = bridged(self.log)
@@ -111,6 +120,12 @@ class DeclaredLog:
                 raise ConfigError(f"dynamics: a double_integrator avoids bodies of known velocities, {body!r} has none")
             if joint and not known[:, j].any():
                 raise ConfigError(f"barriers: rows use the accelerations of all bodies, and {body!r} has none")
+
+    def _require_headings(self) -> None:
+        known = self.log.with_headings
+        for robot in self.config.robots(self.log.bodies):
+            if robot not in known:
+                raise ConfigError(f"body: {self.log.source}: robot {robot!r} has no heading (an obstacle needs none)")
 
     @property
     def row_labels(self) -> list[str]:
@@ -167,7 +182,7 @@ class DeclaredLog:
             lost=at(kept, log.lost),
             bridged=None if log.bridged is None else log.bridged[kept] | log.bridged[moved],
         )
-        return replace(self, config=self.config.model_copy(update={"velocity": "logged"}), log=shifted)
+        return replace(self, config=self.config.model_copy(update={"velocity": "logged", "body": None}), log=shifted)
 
     def with_bound(self, bound: float) -> DeclaredLog:
         """The same log and model with another bound on the error of controls."""

@@ -103,7 +103,8 @@ def check_log(path: Path, models: Mapping[str, ObserveConfig], folder: ResultsFo
 
 def _read(path: Path, models: Mapping[str, ObserveConfig]) -> Log:
     first = next(iter(models.values()))
-    return read_log(path, first.bag, first.log)
+    heading = None if first.body is None else first.body.heading
+    return read_log(path, first.bag, heading, first.log)
 
 
 def _ready(models: Mapping[str, DeclaredLog]) -> Observation | Hypotheses:

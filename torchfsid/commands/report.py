@@ -61,9 +61,11 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
         )
     if observation.declared.contacts:
         console.print(
-            f"{observation.declared.contacts} times a body did not move as its logged velocity says (contacts, perhaps, "
-            "or another time step): the velocity it arrived with counts as uncertain."
+            f"{observation.declared.contacts} times a body did not move as its logged velocity says (contacts, perhaps): "
+            "the velocity it arrived with counts as uncertain."
         )
+    if observation.declared.recovery is not None:
+        _print_lines([observation.declared.recovery.sentence()], console)
     _print_events(observation, console)
     if isinstance(observation.sets, SetMembershipObserver) and observation.sets.windows_used:
         shares = ", ".join(f"{length:g} s {share:.0%}" for length, share in observation.sets.windows_used.items())
@@ -206,7 +208,10 @@ def print_hypotheses(hypotheses: Hypotheses, out: Path, console: Console) -> Non
         explains_some = bool((sets.status < Status.INCONSISTENT).any())
         if isinstance(sets, SafetyObserver) and sets.team_is_refuted and explains_some:
             console.print(escape(f"{name}: the robots have no safety parameters in common, each has its own"))
-    quantity = next(iter(hypotheses.observations.values())).config.noise.quantity
+    first = next(iter(hypotheses.observations.values()))
+    if first.declared.recovery is not None:
+        _print_lines([first.declared.recovery.sentence()], console)
+    quantity = first.config.noise.quantity
     _print_bound(console, hypotheses.smallest_bounds, hypotheses.bound, quantity)
     console.print(escape(f"Results: {out}/hypotheses.json, and a folder for each of {', '.join(names)}"))
 

@@ -1,14 +1,16 @@
 """The section `log` of an observe file: logs in the forms in which motion capture exports them.
 
-log: {format: optitrack}                                      an export of Motive, CSV; bodies: {r1: "Rigid Body 1"}
-log: {format: vicon}                                          an export of Nexus or Tracker, CSV; likewise
-log: {format: tum}                                            a folder of files t x y z qx qy qz qw, one per robot
-log:                                                          any other table, by the names of its columns
-  format: columns
-  header_line: 7
-  time: "Time (Seconds)"
-  unit: mm
-  bodies: {r1: {x: "r1 X", y: "r1 Y"}, cf2: {file: cf2.csv, x: stateEstimate.x, y: stateEstimate.y}}
+    log: {format: optitrack}           an export of Motive, CSV; bodies: {r1: "Rigid Body 1"} takes some and names them
+    log: {format: vicon}               an export of Nexus or Tracker, CSV; likewise
+    log: {format: tum}                 a folder of files t x y z qx qy qz qw, one per robot; bodies: {r1: a.txt}
+    log:                               any other table, by the names of its columns
+      format: columns
+      header_line: 7
+      time: "Time (Seconds)"
+      unit: mm
+      bodies: {r1: {x: "r1 X", y: "r1 Y", heading: "r1 yaw"}, cf2: {file: cf2.csv, x: state.x, y: state.y}}
+
+All other keys are optional.
 """
 
 from __future__ import annotations
@@ -41,6 +43,7 @@ class BodyColumns(Strict):
         vx: velocity [unit of length per s].
         vy: velocity.
         vz: velocity.
+        heading: heading, counterclockwise seen from above [`angle`].
     """
 
     file: ColumnName | None = None
@@ -50,6 +53,7 @@ class BodyColumns(Strict):
     vx: ColumnName | None = None
     vy: ColumnName | None = None
     vz: ColumnName | None = None
+    heading: ColumnName | None = None
 
 
 def _name_or_columns(value: Any) -> str:
@@ -69,6 +73,7 @@ class LogConfig(Strict):
         up: vertical axis of the export. With `y` the plane is (x, -z), seen from above. Default: `y` for `optitrack`,
             otherwise `z`.
         unit: unit of length. Default: what the export says, otherwise `m`.
+        angle: unit of headings in `columns`.
         radius: radius of every body [m].
     """
 
@@ -85,6 +90,7 @@ class LogConfig(Strict):
     header_line: Annotated[int, Field(strict=True, ge=1)] = 1
     up: Literal["y", "z"] | None = None
     unit: Literal["m", "cm", "mm"] | None = None
+    angle: Literal["rad", "deg"] = "rad"
     radius: dict[BodyName, NonNegative] | None = None
 
     @property

@@ -14,6 +14,7 @@ from pydantic import Discriminator, Field, Tag, model_validator
 from torchfsid.config.avoidance import AvoidanceConfig
 from torchfsid.config.bags import BagConfig
 from torchfsid.config.barriers import BarrierConfig
+from torchfsid.config.bodies import UnicycleConfig
 from torchfsid.config.documents import Strict, wrong
 from torchfsid.config.motion_capture import LogConfig
 from torchfsid.config.observers import AccelerationNoiseConfig, ObservedNoiseConfig, PriorConfig, UkfConfig
@@ -72,13 +73,15 @@ class ObserveConfig(Strict):
             of positions, accelerations from those of velocities. `windows` reads means over windows of positions, whose
             errors are `noise.position`. `noise.velocity` is then the error of the controllers alone.
         windows: lengths of these windows [s]. Default: those of 0.1, 0.25, 0.5 and 1 s that have two samples or more.
+        body: unicycles, whose commands are recovered from their poses. Default: robots that move as commanded.
         obstacles: bodies of the log that are avoided but not inferred.
         on_inconsistent: what happens to a set when the intersection is empty: `hold` keeps it, `reset` starts again
             from the prior, `raise` ends the command.
         outliers: the number of samples per robot that may be left unexplained (`observers.outliers`).
         bag: where the bodies are in a ROS bag. Other logs ignore it.
         log: the form of a log of motion capture. Other logs have columns of their own.
-        ukf: the unscented Kalman filter that runs beside the sets, or False for none.
+        ukf: the unscented Kalman filter that runs beside the sets, or False for none. It is left out with the map
+            `si_to_uni`, since positions then do not follow the commands.
     """
 
     task: TaskConfig
@@ -90,6 +93,7 @@ class ObserveConfig(Strict):
     dynamics: Dynamics = "single_integrator"
     velocity: Literal["logged", "differentiated", "windows"] = "logged"
     windows: Annotated[tuple[Positive, ...], Field(min_length=1)] | None = None
+    body: UnicycleConfig | None = None
     obstacles: tuple[BodyName, ...] = ()
     on_inconsistent: Literal["hold", "reset", "raise"] = "hold"
     outliers: Annotated[int, Field(strict=True, ge=0)] = 0
@@ -103,6 +107,7 @@ class ObserveConfig(Strict):
         if got != expected:
             raise wrong(f"task '{self.task.kind}' has {expected} parameters, lower and upper have {got}", "prior")
         require_one_order(self.dynamics, self.task, self.barriers, self.noise)
+        self._require_poses()
         unknown = [i for i, barrier in enumerate(self.barriers) if barrier.is_unknown]
         if len(unknown) > 1:
             raise wrong("one barrier may have unknown parameters, and another one has", f"barriers[{unknown[1]}]")
@@ -153,6 +158,21 @@ class ObserveConfig(Strict):
             raise wrong(f"expected 0 with an unknown {what}", "outliers")
         if self.noise.control == "auto":
             raise wrong("auto takes an outlier for noise, give a number", "noise")
+
+    def _require_poses(self) -> None:
+        """Check, in a validator, that a body fits the rest, and that there is one if a bound on headings is given."""
+        if self.body is None:
+            if getattr(self.noise, "heading", 0.0):
+                raise wrong(
+                    "robots have headings only with a body, e.g. {kind: unicycle, map: si_to_uni}", "noise.heading"
+                )
+            return
+        if self.is_second_order:
+            raise wrong("unicycles are driven by velocities, expected dynamics: single_integrator", "body")
+        if self.velocity != "differentiated":
+            raise wrong(
+                f"commands of unicycles come from poses: expected 'differentiated', got {self.velocity!r}", "velocity"
+            )
 
     @property
     def is_second_order(self) -> bool:
@@ -241,7 +261,7 @@ class ObserveConfig(Strict):
                 windows=self.windows or (),
                 outliers=self.outliers,
             )
-        if self.ukf is False:
+        if self.ukf is False or (self.body is not None and self.body.map == "si_to_uni"):
             return sets
         ukf = self.ukf.build(task, known, self.prior, robots, self.active_tolerance)
         return HybridObserver(sets, ukf, feedback=self.ukf.feedback)

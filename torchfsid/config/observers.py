@@ -139,9 +139,15 @@ class _ObservedErrors(_Errors):
 
 
 class ObservedNoiseConfig(_ObservedErrors):
-    """`NoiseConfig` for a log. With `velocity: auto` the bound is determined from the log itself."""
+    """`NoiseConfig` for a log. With `velocity: auto` the bound is determined from the log itself.
+
+    Attributes:
+        velocity: bound on the error of controls [m/s], or `auto`.
+        heading: bound on the error of the headings of unicycles [rad].
+    """
 
     velocity: Bound
+    heading: NonNegative = 0.0
     quantity: ClassVar[Literal["velocity", "acceleration"]] = "velocity"
     unit: ClassVar[str] = "m/s"
 
@@ -151,7 +157,7 @@ class ObservedNoiseConfig(_ObservedErrors):
         return _bound_or_auto(value, cls.unit)
 
     def _built(self) -> NoiseBound:
-        return NoiseConfig(**self.model_dump()).build()
+        return NoiseConfig(**self.model_dump(exclude={"heading"})).build()
 
 
 class AccelerationNoiseConfig(_ObservedErrors):

@@ -19,7 +19,7 @@ from jaxtyping import Int
 from torchfsid.config.bags import BagConfig
 from torchfsid.errors import ConfigError, FsidError, LogError, one_line
 from torchfsid.logs.log import Log
-from torchfsid.logs.messages import ACCELERATION, ODOMETRY, POSE, TRANSFORMS, Sample, nanoseconds, sample_of
+from torchfsid.logs.messages import ACCELERATION, ODOMETRY, POSE, TRANSFORMS, Sample, heading, nanoseconds, sample_of
 from torchfsid.logs.motion import Motion, start_of
 from torchfsid.logs.reading import Reading
 from torchfsid.logs.resampling import Series, Track, log_of_tracks
@@ -31,11 +31,16 @@ MAX_TIMES = 1_000_000
 """More times of a clock are a slip of the pen in its rate, or in somebody's stamps."""
 
 
-def read_bag(path: str | Path, bag: BagConfig) -> Log:
+def read_bag(path: str | Path, bag: BagConfig, with_headings: bool = False) -> Log:
     """The log in a bag: a folder with metadata.yaml, or a single .mcap or .db3 file.
 
     Bodies whose stamps differ are resampled onto one clock, with bounds on the errors (`resampling`). Stamps since 1970
     are counted from the first.
+
+    Args:
+        path: the folder or file.
+        bag: where the bodies are.
+        with_headings: read the orientations of the poses, too.
 
     Raises:
         LogError: the file cannot be read, or is not such a bag.
@@ -61,7 +66,7 @@ def read_bag(path: str | Path, bag: BagConfig) -> Log:
     for origin, body in bag.origins:
         motion = from_start(origin, motions[origin])
         motion.require_level(f"{source}: {origin}")
-        tracks.append(Track.of(body, motion, series.get(body)))
+        tracks.append(Track.of(body, motion if with_headings else motion._replace(heading=None), series.get(body)))
     clock = None if bag.rate is None else _clock(tracks[0].stamps, bag.rate)
     radius = None if bag.radius is None else np.array([bag.radius[track.body] for track in tracks])
     log = log_of_tracks(source, tracks, clock, radius)
@@ -121,6 +126,7 @@ class _Content:
             None if ordered[0].u is None else np.array([sample.u for sample in ordered]),
             np.array([sample.position_error for sample in ordered]),
             np.array([sample.velocity_error for sample in ordered]),
+            np.array([sample.heading for sample in ordered]),
         )
         if self.transforms is None:
             return motion
@@ -177,8 +183,9 @@ def _add_frames(content: _Content, message: Any, bag: BagConfig) -> None:
     """Take in the transforms of bodies, each as a position in its parent."""
     for transform in message.transforms:
         if transform.child_frame_id in bag.frames:
-            header, x = transform.header, transform.transform.translation
-            sample = Sample(nanoseconds(header.stamp), header.frame_id.removeprefix("/"), (x.x, x.y, x.z))
+            header, x, turned = transform.header, transform.transform.translation, heading(transform.transform.rotation)
+            frame = header.frame_id.removeprefix("/")
+            sample = Sample(nanoseconds(header.stamp), frame, (x.x, x.y, x.z), heading=turned)
             content.samples[f"frame {transform.child_frame_id!r}"].append(sample)
 
 

@@ -10,6 +10,7 @@ columns            any CSV with one line of names
 
 from __future__ import annotations
 
+import math
 import reprlib
 from collections.abc import Iterator, Sequence
 from decimal import Decimal
@@ -28,6 +29,9 @@ TUM_NAMES = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 UNITS = {"Meters": "m", "Centimeters": "cm", "Millimeters": "mm"}
 """Units of length, as Motive writes them."""
 
+ANGLES = {"rad": 1.0, "deg": math.pi / 180}
+"""Units of angles [rad]."""
+
 LAST = 9_000_000_000_000_000_000
 """Largest stamp [ns]: whole numbers of 64 bits end there."""
 
@@ -41,6 +45,8 @@ class Recorded(NamedTuple):
         stamps: time of each table row [ns].
         columns: names of columns, by axis: x, y, z, perhaps vx, vy, vz.
         power: unit of length, as a power of ten of a metre.
+        heading: the column of headings, or those of a quaternion x, y, z, w. Empty if there is none.
+        angle: unit of headings [rad].
     """
 
     body: str
@@ -48,6 +54,8 @@ class Recorded(NamedTuple):
     stamps: Int[np.ndarray, "rows"]
     columns: dict[str, str]
     power: int
+    heading: tuple[str, ...] = ()
+    angle: float = 1.0
 
 
 def recorded(path: Path, form: LogConfig) -> list[Recorded]:
@@ -86,8 +94,10 @@ def _by_columns(path: Path, form: LogConfig) -> list[Recorded]:
         columns = {name: column for name, column in given.model_dump(exclude={"file"}).items() if column is not None}
         for column in columns.values():
             require_column(table, column)
+        heading = tuple(column for name, column in columns.items() if name == "heading")
+        columns.pop("heading", None)
         power = SCALES[form.unit or "m"]
-        found.append(Recorded(body, table, stamps, columns, power))
+        found.append(Recorded(body, table, stamps, columns, power, heading, ANGLES[form.angle]))
     return found
 
 
@@ -116,7 +126,7 @@ def _of_tum(body: str, file: Path, form: LogConfig) -> Recorded:
         records += [Record(i + 1, cells)] if cells else []
     table = CsvTable(str(file), records)
     stamps = _stamps(table, "t", TIME_UNITS[form.time_unit])
-    return Recorded(body, table, stamps, {axis: axis for axis in "xyz"}, SCALES[form.unit or "m"])
+    return Recorded(body, table, stamps, {axis: axis for axis in "xyz"}, SCALES[form.unit or "m"], TUM_NAMES[4:])
 
 
 def _optitrack(path: Path, form: LogConfig) -> Iterator[Recorded]:
@@ -145,7 +155,9 @@ def _optitrack(path: Path, form: LogConfig) -> Iterator[Recorded]:
     if unit is None:
         raise LogError(f"{path} line 1: unknown units of length {told['Length Units']!r} (log.unit)")
     for name in dict.fromkeys(names[i] for i in range(2, width) if kinds[i] == "Rigid Body"):
-        yield _of(name, table, stamps, {axis: f"{name} Position {axis.upper()}" for axis in "xyz"}, unit)
+        body = _of(name, table, stamps, {axis: f"{name} Position {axis.upper()}" for axis in "xyz"}, unit)
+        turned = tuple(f"{name} Rotation {axis}" for axis in "XYZW")
+        yield body._replace(heading=turned if set(turned) <= set(labels) else ())
 
 
 def _vicon(path: Path, form: LogConfig) -> Iterator[Recorded]:
@@ -168,7 +180,9 @@ def _vicon(path: Path, form: LogConfig) -> Iterator[Recorded]:
     unit = form.unit or next((unit.strip() for unit in units[2:] if unit.strip() in SCALES), "mm")
     for name in dict.fromkeys(name.strip() for name in names[2:] if name.strip()):
         columns = {axis: f"{name} {'' if marker else 'T'}{axis.upper()}" for axis in "xyz"}
-        yield _of(name, table, stamps, columns, unit)
+        body, turned = _of(name, table, stamps, columns, unit), f"{name} RZ"
+        angle = units[labels.index(turned)].strip() if turned in labels[: len(units)] else ""
+        yield body._replace(heading=(turned,), angle=ANGLES[angle]) if angle in ANGLES else body
 
 
 def _of(name: str, table: CsvTable, stamps: np.ndarray, columns: dict[str, str], unit: str) -> Recorded:

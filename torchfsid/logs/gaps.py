@@ -15,8 +15,9 @@ body in the log, in place of v,
 Proof: x - x_true = (1 - l) (x(s) - x_true) + l (x(s + h) - x_true), and x_true is at most l h v away from x(s) and (1 -
 l) h v from x(s + h). The same holds for u.
 
-A body that is seen at s but not at the next sample has no velocity from differences of positions, and the cells of a
-logged velocity may be empty. It is then 0 with an error of v as well, while the position is that of the sample.
+A body that is seen at s but not at the next sample has no velocity from differences of positions. Its velocity is then
+0 with an error of v as well, while its position is that of the sample. Commands of unicycles that poses do not show
+stay unknown: they may be larger than all others.
 
 Errors of the samples are interpolated and added, with the same weights as the samples. Where the velocity of a robot
 that is driven by accelerations is unknown at one end of a gap, it is unknown in the gap.
@@ -41,7 +42,8 @@ def bridged(log: Log) -> Log:
     later = np.minimum.accumulate(np.where(log.seen, np.arange(len(log.t))[:, None], len(log.t))[::-1], axis=0)[::-1]
     gap = ~log.seen & (earlier >= 0) & (later < len(log.t))
     goes_on = np.arange(len(log.t))[:, None] < earlier[-1]
-    unknown = log.seen & ~log.velocity_known & goes_on & (log.u is not None and log.a is None)
+    leaves = log.seen & ~np.concatenate([log.seen[1:], log.seen[-1:]])
+    unknown = leaves & ~log.velocity_known & goes_on & (log.u is not None and log.a is None)
     if log.lost is not None or not (gap | unknown).any():
         return log
     k, j = np.nonzero(gap)

@@ -6,6 +6,8 @@ increase. Other columns are ignored.
     t, robot, x, y[, z][, vx, vy[, vz]][, ax, ay[, az]][, radius]          [s], a name, [m], [m/s], [m/s2], [m]
     [, position_error][, velocity_error][, acceleration_error]     bounds on the errors of this row, in the same units
 
+Headings of unicycles [rad] are in a column of any name, and empty for other bodies.
+
 (vx, vy) is the control computed at t from the positions at t. It is held until the next sample t_+ (zero-order hold).
 If it was not logged, it is exactly (x(t_+) - x(t)) / (t_+ - t). Of robots that are driven by accelerations, (vx, vy) is
 the velocity at t, and (ax, ay) the control. If that was not logged, it is exactly (v(t_+) - v(t)) / (t_+ - t). Where
@@ -28,7 +30,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from torchfsid.errors import LogError
-from torchfsid.logs.quantities import quantities_in, radii_in, times_in
+from torchfsid.logs.quantities import headings_in, quantities_in, radii_in, repeats_in, times_in
 from torchfsid.logs.reading import UNITS, Reading
 from torchfsid.logs.tables import CsvTable, ParquetTable, Table, require_column
 
@@ -57,6 +59,8 @@ class Log:
         lost: the body is there at t but its position is unknown. None means that a body that is not seen is not there.
         bridged: the body was not measured at t, and its position is interpolated (see `gaps`). It is then not observed
             itself.
+        heading: headings of unicycles [rad], or None if they were not asked for.
+        oriented: the body is there at t and its heading is known. None if headings were not asked for.
         reading: what was found while the log was read.
     """
 
@@ -75,7 +79,16 @@ class Log:
     a: Float[np.ndarray, "times bodies n"] | None = None
     acceleration_known: Bool[np.ndarray, "times bodies"] | None = None
     acceleration_error: Float[np.ndarray, "times bodies"] | None = None
+    heading: Float[np.ndarray, "times bodies"] | None = None
+    oriented: Bool[np.ndarray, "times bodies"] | None = None
     reading: Reading = field(default_factory=Reading)
+
+    @property
+    def with_headings(self) -> tuple[str, ...]:
+        """The bodies of which some heading is known."""
+        if self.oriented is None:
+            return ()
+        return tuple(body for j, body in enumerate(self.bodies) if self.oriented[:, j].any())
 
     @property
     def controls(self) -> tuple[Float[np.ndarray, "times bodies n"] | None, Bool[np.ndarray, "times bodies"]]:
@@ -258,25 +271,33 @@ def _one_earlier(values: np.ndarray) -> np.ndarray:
     return np.concatenate([np.zeros_like(values[:1]), values[:-1]])
 
 
-def read_csv(path: str | Path) -> Log:
+def read_csv(path: str | Path, heading: str | None = None) -> Log:
     """The log in a CSV file (UTF-8, one header line).
+
+    Args:
+        path: the file.
+        heading: the column of headings, if they are wanted.
 
     Raises:
         LogError: the file cannot be read, or is not such a log. The message names the line and the column.
     """
-    return _log_in(CsvTable(str(path)))
+    return _log_in(CsvTable(str(path)), heading)
 
 
-def read_parquet(path: str | Path) -> Log:
+def read_parquet(path: str | Path, heading: str | None = None) -> Log:
     """The log in a Parquet file with the same columns. Needs the extra `parquet`.
+
+    Args:
+        path: the file.
+        heading: the column of headings, if they are wanted.
 
     Raises:
         LogError: the file cannot be read, or is not such a log. The message names the table row and the column.
     """
-    return _log_in(ParquetTable(str(path)))
+    return _log_in(ParquetTable(str(path)), heading)
 
 
-def _log_in(table: Table) -> Log:
+def _log_in(table: Table, heading: str | None) -> Log:
     axes = [axis for axis in "xyz" if axis in "xy" or axis in table.header]
     velocities = [f"v{axis}" for axis in "xyz" if f"v{axis}" in table.header]
     accelerations = [f"a{axis}" for axis in axes]
@@ -296,14 +317,12 @@ def _log_in(table: Table) -> Log:
     body = np.fromiter((slot[name] for name in names), dtype=np.int64, count=len(names))
     quantities = quantities_in(table, {"position": axes, "velocity": velocities, "acceleration": accelerations})
     place = time * len(bodies) + body
-    order = np.argsort(place, kind="stable")
-    first, again = (order[:-1], order[1:])
-    repeats = np.flatnonzero(place[first] == place[again])
-    first, again = first[repeats], again[repeats]
-    same = np.all([quantity.equal(first, again) for quantity in quantities.values()], axis=0)
+    repeats, same = repeats_in(place, quantities)
     if not same.all():
-        i = int(again[~same].min())
+        i = int(repeats[~same].min())
         raise table.error(i, f"robot {names[i]!r} has another row at t = {t[i]}")
+
+    headings = None if heading is None else headings_in(table, heading)
 
     def by_time_and_body(of_rows: np.ndarray) -> np.ndarray:
         values = np.zeros((time[-1] + 1, len(bodies), *of_rows.shape[1:]), dtype=of_rows.dtype)
@@ -331,6 +350,8 @@ def _log_in(table: Table) -> Log:
         a=None if a is None else by_time_and_body(a.values),
         acceleration_known=None if a is None else by_time_and_body(a.known),
         acceleration_error=bounds("acceleration"),
+        heading=None if headings is None else by_time_and_body(np.nan_to_num(headings)),
+        oriented=None if headings is None else by_time_and_body(np.isfinite(headings)),
         reading=Reading(
             rounding={name: of.rounding for name, of in quantities.items() if of.rounding > 0}, duplicates=len(repeats)
         ),

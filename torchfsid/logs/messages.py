@@ -17,9 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from torchfsid.errors import LogError
-
-UNIT = 1e-2
-"""How far a quaternion's norm may be from 1; all zeros, the usual mistake, is no orientation."""
+from torchfsid.logs.motion import heading_of, rotation_of
 
 ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
 ACCELERATION, TRANSFORMS = "geometry_msgs/msg/AccelStamped", "tf2_msgs/msg/TFMessage"
@@ -35,6 +33,7 @@ class Sample(NamedTuple):
         u: velocity in the same frame [m/s], or None.
         position_error: bound on the error of x [m].
         velocity_error: bound on the error of u [m/s].
+        heading: direction of the body's x-axis [rad], NaN if it has none.
     """
 
     stamp: int
@@ -43,6 +42,7 @@ class Sample(NamedTuple):
     u: tuple[float, float, float] | None = None
     position_error: float = 0.0
     velocity_error: float = 0.0
+    heading: float = math.nan
 
 
 def sample_of(where: str, kind: str, message: Any, multiple: float | None) -> Sample:
@@ -60,16 +60,16 @@ def sample_of(where: str, kind: str, message: Any, multiple: float | None) -> Sa
     header = message.header
     stamp, frame = nanoseconds(header.stamp), header.frame_id.removeprefix("/")
     if kind == POSE:
-        return Sample(stamp, frame, _vector(message.pose.position))
+        return Sample(stamp, frame, _vector(message.pose.position), heading=heading(message.pose.orientation))
     if kind == ACCELERATION:
         return Sample(stamp, frame, _vector(message.accel.linear))
     turn = np.eye(3)
     if message.child_frame_id != header.frame_id:
         turn = rotation(where, message.pose.pose.orientation)
     x, u = _vector(message.pose.pose.position), turn @ _vector(message.twist.twist.linear)
-    velocity = (float(u[0]), float(u[1]), float(u[2]))
+    velocity, turned = (float(u[0]), float(u[1]), float(u[2])), heading(message.pose.pose.orientation)
     if multiple is None:
-        return Sample(stamp, frame, x, velocity)
+        return Sample(stamp, frame, x, velocity, heading=turned)
     of_pose, of_twist = (
         _covariance(where, name, of.covariance) for name, of in (("pose", message.pose), ("twist", message.twist))
     )
@@ -77,7 +77,7 @@ def sample_of(where: str, kind: str, message: Any, multiple: float | None) -> Sa
     position = multiple * _deviation(of_pose[:3, :3])
     return Sample(
         stamp, frame, x, velocity, position,
-        multiple * (_deviation(turn @ of_twist[:3, :3] @ turn.T) + math.hypot(*velocity[:2]) * yaw),
+        multiple * (_deviation(turn @ of_twist[:3, :3] @ turn.T) + math.hypot(*velocity[:2]) * yaw), turned,
     )  # fmt: skip
 
 
@@ -87,18 +87,21 @@ def nanoseconds(stamp: Any) -> int:
 
 
 def rotation(where: str, q: Any) -> Float[np.ndarray, "3 3"]:
-    """The matrix that turns vectors by the quaternion q, whose norm may differ slightly from 1.
-
-    R = I + (2 w K + 2 K^2) / norm^2, with K the matrix of the cross product with (x, y, z).
+    """The matrix that turns vectors by the quaternion q.
 
     Raises:
         LogError: it is no unit quaternion.
     """
-    norm = math.hypot(q.w, q.x, q.y, q.z)
-    if not abs(norm - 1) <= UNIT:
+    turn = rotation_of(q.x, q.y, q.z, q.w)
+    if turn is None:
         raise LogError(f"{where}: expected a unit quaternion, got {(q.x, q.y, q.z, q.w)}")
-    cross = np.array([[0.0, -q.z, q.y], [q.z, 0.0, -q.x], [-q.y, q.x, 0.0]])
-    return np.eye(3) + 2 / norm**2 * (q.w * cross + cross @ cross)
+    return turn
+
+
+def heading(q: Any) -> float:
+    """The direction in the plane of the x-axis of a body with the orientation q [rad]. NaN if it has none."""
+    turn = rotation_of(q.x, q.y, q.z, q.w)
+    return math.nan if turn is None else heading_of(turn[:, 0])
 
 
 def _vector(message: Any) -> tuple[float, float, float]:

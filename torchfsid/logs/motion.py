@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -13,6 +14,12 @@ from torchfsid.logs.tables import A_NUMBER, is_measurable
 
 LEVEL = 0.1
 """Largest change of height of a body that moves in the plane [m]: uneven floors, jitter, a drone that hovers."""
+
+TILTED = 0.5
+"""Sine of the angle between the plane and a body's x-axis beyond which its direction in the plane says nothing."""
+
+UNIT = 1e-2
+"""How far a quaternion's norm may be from 1; all zeros, the usual mistake, is no orientation."""
 
 LONG_AGO = 1_000_000_000_000_000
 """Stamps beyond this [ns], eleven days, are times since 1970. As seconds in a double they would lose nanoseconds, so
@@ -28,6 +35,7 @@ class Motion(NamedTuple):
         u: velocities [m/s], or None.
         position_error: bounds on the errors of x in the plane [m].
         velocity_error: bounds on the errors of u in the plane [m/s].
+        heading: directions of the body's x-axis in the plane [rad], NaN where unknown, or None.
     """
 
     stamps: Int[np.ndarray, "samples"]
@@ -35,6 +43,7 @@ class Motion(NamedTuple):
     u: Float[np.ndarray, "samples 3"] | None
     position_error: Float[np.ndarray, "samples"]
     velocity_error: Float[np.ndarray, "samples"]
+    heading: Float[np.ndarray, "samples"] | None = None
 
     @classmethod
     def exact(
@@ -68,6 +77,23 @@ class Motion(NamedTuple):
         low, high = float(self.x[:, 2].min()), float(self.x[:, 2].max())
         if not high - low <= LEVEL:
             raise LogError(f"{where}: robots in the plane only, but the height changes from {low:g} to {high:g} m")
+
+
+def rotation_of(x: float, y: float, z: float, w: float) -> Float[np.ndarray, "3 3"] | None:
+    """The matrix that turns vectors by a quaternion whose norm may differ slightly from 1. None if it is no unit.
+
+    R = I + (2 w K + 2 K^2) / norm^2, with K the matrix of the cross product with (x, y, z).
+    """
+    norm = math.hypot(w, x, y, z)
+    if not abs(norm - 1) <= UNIT:
+        return None
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + 2 / norm**2 * (w * cross + cross @ cross)
+
+
+def heading_of(ahead: Float[np.ndarray, "3"]) -> float:
+    """The direction in the plane of a body's x-axis (x, y, height) [rad]. NaN if it is steep."""
+    return math.atan2(ahead[1], ahead[0]) if abs(ahead[2]) <= TILTED else math.nan
 
 
 def start_of(stamps: Iterable[int]) -> int:

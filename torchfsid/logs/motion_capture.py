@@ -19,7 +19,7 @@ from torchfsid.config.motion_capture import LogConfig
 from torchfsid.errors import ConfigError, LogError
 from torchfsid.logs.exports import Recorded, recorded
 from torchfsid.logs.log import Log
-from torchfsid.logs.motion import Motion, start_of
+from torchfsid.logs.motion import Motion, heading_of, rotation_of, start_of
 from torchfsid.logs.quantities import LONGEST_STEP
 from torchfsid.logs.reading import Reading, half_units
 from torchfsid.logs.resampling import Track, log_of_tracks, seconds
@@ -28,8 +28,13 @@ SHARED = 0.5
 """Part of a body's times that another one has too, from which on their times are the same, with samples missing."""
 
 
-def read_motion_capture(path: str | Path, form: LogConfig) -> Log:
+def read_motion_capture(path: str | Path, form: LogConfig, with_headings: bool = False) -> Log:
     """The log in an export of motion capture.
+
+    Args:
+        path: the file or folder.
+        form: what the export is.
+        with_headings: read the orientations, too.
 
     Raises:
         LogError: a file cannot be read, or is not of that form. The message names the line.
@@ -43,6 +48,8 @@ def read_motion_capture(path: str | Path, form: LogConfig) -> Log:
         first, times = _first_rows(of)
         repeats[of.table.source] = len(of.stamps) - len(first)
         motion = _motion(of, first, times - start, form)
+        if with_headings:
+            motion = motion._replace(heading=_headings(of, first[np.isin(times - start, motion.stamps)], form))
         where = f"{of.table.source}: {of.body!r}"
         if len(motion.stamps) < 2:
             raise LogError(f"{where}: expected at least 2 samples, got {len(motion.stamps)}")
@@ -108,6 +115,20 @@ def _motion(of: Recorded, rows: np.ndarray, stamps: np.ndarray, form: LogConfig)
     return Motion(stamps[seen], x[seen], u, x_error[seen], u_error[seen])
 
 
+def _headings(of: Recorded, rows: np.ndarray, form: LogConfig) -> Float[np.ndarray, "samples"]:
+    """The headings in these table rows [rad], NaN where they are unknown."""
+    cells = [of.table.numbers(column, True)[rows] for column in of.heading]
+    if len(cells) == 1:
+        return cells[0] * of.angle
+    headings = np.full(len(rows), np.nan)
+    for k, quaternion in enumerate(zip(*cells, strict=True)):
+        turn = rotation_of(*quaternion)
+        if turn is not None:
+            x, y, z = turn[:, 0]
+            headings[k] = heading_of(np.array([x, -z, y] if form.vertical == "y" else [x, y, z]))
+    return headings
+
+
 def _log(source: str, tracks: Sequence[Track], radius: Float[np.ndarray, "bodies"] | None, in_one_table: bool) -> Log:
     """The tracks as one log: with common times and gaps, or resampled."""
     everyones = np.concatenate([track.stamps for track in tracks])
@@ -117,11 +138,14 @@ def _log(source: str, tracks: Sequence[Track], radius: Float[np.ndarray, "bodies
         return log_of_tracks(source, tracks, None, radius)
     shape = len(stamps), len(tracks)
     seen, x, u = np.zeros(shape, dtype=bool), np.zeros((*shape, 2)), np.zeros((*shape, 2))
+    heading = np.full(shape, np.nan)
     position_error, velocity_error, known = np.zeros(shape), np.zeros(shape), np.zeros(shape, dtype=bool)
+    has_headings = any(track.heading is not None for track in tracks)
     for j, track in enumerate(tracks):
         rows = np.searchsorted(stamps, track.stamps)
         seen[rows, j], x[rows, j] = True, track.x
         position_error[rows, j] = 0.0 if track.position_error is None else track.position_error
+        heading[rows, j] = np.nan if track.heading is None else track.heading
         if track.u is not None:
             known[rows, j], u[rows, j] = True, track.u
             velocity_error[rows, j] = 0.0 if track.velocity_error is None else track.velocity_error
@@ -136,6 +160,8 @@ def _log(source: str, tracks: Sequence[Track], radius: Float[np.ndarray, "bodies
         radius=radius,
         position_error=position_error if position_error.any() else None,
         velocity_error=velocity_error if velocity_error.any() else None,
+        heading=np.nan_to_num(heading) if has_headings else None,
+        oriented=np.isfinite(heading) if has_headings else None,
     )
 
 

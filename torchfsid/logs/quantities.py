@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -55,6 +56,17 @@ def times_in(table: Table) -> Float[np.ndarray, "rows"]:
     return t
 
 
+def headings_in(table: Table, column: str) -> Float[np.ndarray, "rows"]:
+    """The headings [rad], NaN where the cells are empty.
+
+    Raises:
+        LogError: there is no such column, or a cell is not a number.
+    """
+    if table.header.count(column) != 1:
+        raise table.header_error(f"body.heading: no single {column!r} in the header {reprlib.repr(table.header)}")
+    return table.numbers(column, may_be_empty=True)
+
+
 def radii_in(table: Table, names: Sequence[str], body: Int[np.ndarray, "rows"]) -> Float[np.ndarray, "bodies"]:
     """The column `radius`, one number for each body.
 
@@ -76,6 +88,16 @@ def radii_in(table: Table, names: Sequence[str], body: Int[np.ndarray, "rows"]) 
         i = int(np.argmax(changed))
         raise table.error(i, f"the radius of robot {names[i]!r} changes from {radius[body[i]]} to {values[i]}")
     return radius
+
+
+def repeats_in(
+    place: Int[np.ndarray, "rows"], quantities: Mapping[str, Quantity]
+) -> tuple[Int[np.ndarray, "k"], Bool[np.ndarray, "k"]]:
+    """The table rows that have the same place as an earlier one, and whether they say the same."""
+    order = np.argsort(place, kind="stable")
+    repeats = np.flatnonzero(np.diff(place[order]) == 0)
+    first, again = order[repeats], order[repeats + 1]
+    return again, np.all([quantity.equal(first, again) for quantity in quantities.values()], axis=0)
 
 
 def quantities_in(table: Table, columns: Mapping[str, Sequence[str]]) -> dict[str, Quantity]:

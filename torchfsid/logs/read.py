@@ -12,12 +12,15 @@ from torchfsid.logs.log import Log, read_csv, read_parquet
 from torchfsid.logs.motion_capture import read_motion_capture
 
 
-def read_log(path: str | Path, bag: BagConfig | None = None, form: LogConfig | None = None) -> Log:
+def read_log(
+    path: str | Path, bag: BagConfig | None = None, heading: str | None = None, form: LogConfig | None = None
+) -> Log:
     """The log at `path`: a rosbag2 folder, .mcap, .db3 or .parquet. Any other suffix is read as CSV.
 
     Args:
         path: the file or folder.
         bag: where the bodies are in a ROS bag. Other logs ignore it.
+        heading: the column of headings, if they are wanted. Bags and motion capture have orientations instead.
         form: the form of a log of motion capture. None: the suffix decides.
 
     Raises:
@@ -26,7 +29,7 @@ def read_log(path: str | Path, bag: BagConfig | None = None, form: LogConfig | N
     """
     path = Path(path)
     if form is not None:
-        return read_motion_capture(path, form)
+        return read_motion_capture(path, form, with_headings=heading is not None)
     suffix = path.suffix.lower()
     is_folder = path.is_dir()
     if is_folder and not (path / "metadata.yaml").exists():
@@ -36,5 +39,5 @@ def read_log(path: str | Path, bag: BagConfig | None = None, form: LogConfig | N
     if is_folder or suffix in (".mcap", ".db3"):
         if bag is None:
             raise ConfigError("bag: required to read a ROS bag, e.g. bag: {topics: {/r1/odom: r1, /r2/odom: r2}}")
-        return read_bag(path, bag)
-    return read_parquet(path) if suffix == ".parquet" else read_csv(path)
+        return read_bag(path, bag, with_headings=heading is not None)
+    return read_parquet(path, heading) if suffix == ".parquet" else read_csv(path, heading)

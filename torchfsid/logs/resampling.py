@@ -13,8 +13,8 @@ positions at t, and these change continuously even where a command is held. Both
 Bounds on the errors of the samples are interpolated with the same weights and added. A mean velocity is wrong by (e_k +
 e_{k+1}) / h, with e_k the bounds for the positions.
 
-Accelerations have samples of their own. They are interpolated like u, with V the largest change from one of their
-samples to the next.
+Accelerations have samples of their own, and so have the commands of unicycles. They are interpolated like u, with V the
+largest change from one of their samples to the next.
 
 Proof: with m, m' the mean velocities before and after, x(t) = x_k + l h m and x_{k+1} - x_k = h (l m + (1 - l) m'), so
 the error of x is l (1 - l) h (m - m'), and |m - m'| <= V. And |u(t) - u_k| <= l V, |u(t) - u_{k+1}| <= (1 - l) V.
@@ -46,10 +46,14 @@ MIN_RUN = 3
 
 @dataclass(frozen=True)
 class Series:
-    """Accelerations [m/s2] at their own stamps [ns], increasing."""
+    """Accelerations [m/s2] or commands [m/s] at their own stamps [ns], increasing.
+
+    Values that are unknown are NaN. `error` bounds the errors of the values. None means zero.
+    """
 
     stamps: Int[np.ndarray, "samples"]
     values: Float[np.ndarray, "samples 2"]
+    error: Float[np.ndarray, "samples"] | None = None
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,8 @@ class Track:
         acceleration: accelerations, or None if not measured.
         position_error: bounds on the errors of x [m]. None means zero.
         velocity_error: bounds on the errors of u [m/s]. None means zero.
+        heading: headings [rad], NaN where unknown, or None if they were not asked for.
+        command: the commands that the body follows, in place of velocities, or None.
     """
 
     body: str
@@ -73,13 +79,15 @@ class Track:
     acceleration: Series | None = None
     position_error: Float[np.ndarray, "samples"] | None = None
     velocity_error: Float[np.ndarray, "samples"] | None = None
+    heading: Float[np.ndarray, "samples"] | None = None
+    command: Series | None = None
 
     @classmethod
     def of(cls, body: str, motion: Motion, acceleration: Series | None = None) -> Track:
         """The motion of a body in the plane."""
         u = None if motion.u is None else motion.u[:, :2]
         errors = [error if error.any() else None for error in (motion.position_error, motion.velocity_error)]
-        return cls(body, motion.stamps, motion.x[:, :2], u, acceleration, *errors)
+        return cls(body, motion.stamps, motion.x[:, :2], u, acceleration, *errors, heading=motion.heading)
 
 
 @dataclass(frozen=True)
@@ -94,11 +102,16 @@ class ResampledLog(Log):
     tracks: tuple[Track, ...] = ()
     clock: Int[np.ndarray, "times"] | None = None
 
+    @property
+    def with_headings(self) -> tuple[str, ...]:
+        has = (track.heading is not None and bool(np.isfinite(track.heading).any()) for track in self.tracks)
+        return tuple(track.body for track, known in zip(self.tracks, has, strict=True) if known)
+
     def differentiated(self) -> Log:
         """The log with velocities from differences of the bodies' own samples (module docstring)."""
         assert self.clock is not None
         positions = [replace(track, u=None) for track in self.tracks]
-        log = _resampled(self.source, positions, self.clock, self.radius, differentiate=True)
+        log = resampled(self.source, positions, self.clock, self.radius, differentiate=True)
         return replace(log, reading=self.reading)
 
     def accelerated(self, velocity_error: float) -> Log:
@@ -131,12 +144,15 @@ def log_of_tracks(
     first = tracks[0]
     stamps = [track.stamps for track in tracks] + [of.acceleration.stamps for of in tracks if of.acceleration]
     if not all(np.array_equal(others, first.stamps) for others in stamps):
-        return _resampled(source, tracks, first.stamps if clock is None else clock, radius, differentiate=False)
+        return resampled(source, tracks, first.stamps if clock is None else clock, radius, differentiate=False)
     seen = np.ones((len(first.stamps), len(tracks)), dtype=bool)
     with_velocity = [track.u is not None for track in tracks]
     u = np.stack([np.zeros_like(track.x) if track.u is None else track.u for track in tracks], axis=1)
     accelerated = [track.acceleration is not None for track in tracks]
     a = [np.zeros_like(track.x) if track.acceleration is None else track.acceleration.values for track in tracks]
+    nowhere = np.full(len(first.stamps), np.nan)
+    heading = np.stack([nowhere if track.heading is None else track.heading for track in tracks], axis=1)
+    has_headings = any(track.heading is not None for track in tracks)
     return Log(
         source=source,
         bodies=tuple(track.body for track in tracks),
@@ -150,14 +166,15 @@ def log_of_tracks(
         acceleration_known=seen & np.array(accelerated) if any(accelerated) else None,
         position_error=_stacked([track.position_error for track in tracks], len(seen)),
         velocity_error=_stacked([track.velocity_error for track in tracks], len(seen)),
+        heading=np.nan_to_num(heading) if has_headings else None,
+        oriented=np.isfinite(heading) if has_headings else None,
     )
 
 
 def _stacked(errors: Sequence[np.ndarray | None], samples: int) -> Float[np.ndarray, "samples bodies"] | None:
     """The bounds of all tracks. None if no track has any."""
-    if all(error is None for error in errors):
-        return None
-    return np.stack([np.zeros(samples) if error is None else error for error in errors], axis=1)
+    found = [np.zeros(samples) if error is None else error for error in errors]
+    return np.stack(found, axis=1) if any(error is not None for error in errors) else None
 
 
 def seconds(stamps: Int[np.ndarray, "times"]) -> Float[np.ndarray, "times"]:
@@ -179,13 +196,25 @@ class _Samples(NamedTuple):
     acceleration_error: Float[np.ndarray, "times"]
 
 
-def _resampled(
+def resampled(
     source: str,
     tracks: Sequence[Track],
     clock: Int[np.ndarray, "times"],
     radius: Float[np.ndarray, "bodies"] | None,
     differentiate: bool,
 ) -> ResampledLog:
+    """The tracks on the clock, with bounds on the errors (module docstring).
+
+    Args:
+        source: the file, for messages.
+        tracks: one per body.
+        clock: times onto which the bodies are resampled [ns].
+        radius: radii of the bodies [m], or None.
+        differentiate: velocities are mean velocities, except those of bodies with commands.
+
+    Raises:
+        LogError: at no time of the clock are all bodies known.
+    """
     of_each = [_sample(track, clock, differentiate) for track in tracks]
     bodies = _Samples(*(np.stack(of_bodies, axis=1) for of_bodies in zip(*of_each, strict=True)))
     if not bodies.seen.all(axis=1).any():
@@ -236,13 +265,14 @@ def _sample(track: Track, clock: Int[np.ndarray, "times"], differentiate: bool) 
     def errors_at_clock(errors: np.ndarray | None) -> np.ndarray:
         return np.zeros(len(clock)) if errors is None else at_clock(errors[:, None], seen)[:, 0]
 
-    if differentiate:
+    if track.command is not None:
+        u, known, u_error = _interpolated(track.command, clock)
+    elif differentiate:
         known = (after >= 0) & (after < 1) & np.isfinite(change[interval])
         u, u_error = np.where(known[:, None], _mean_velocities(track)[interval], 0.0), bound
         if track.position_error is not None:
-            u_error = bound + (track.position_error[:-1] + track.position_error[1:])[interval] / (
-                periods[interval] * 1e-9
-            )
+            ends = track.position_error[:-1] + track.position_error[1:]
+            u_error = bound + (ends / (periods * 1e-9))[interval]
     else:
         known = seen if track.u is not None else np.zeros_like(seen)
         u = np.zeros((len(clock), 2)) if track.u is None else at_clock(track.u, known)
@@ -261,21 +291,28 @@ def _sample(track: Track, clock: Int[np.ndarray, "times"], differentiate: bool) 
 
 def _accelerations(series: Series | None, clock: Int[np.ndarray, "times"]) -> dict[str, np.ndarray]:
     """The accelerations on the clock. Zero where they are unknown."""
+    names = ("a", "acceleration_known", "acceleration_error")
     if series is None:
         nothing = np.zeros(len(clock))
-        return {"a": np.zeros((len(clock), 2)), "acceleration_known": nothing > 0, "acceleration_error": nothing}
+        return dict(zip(names, (np.zeros((len(clock), 2)), nothing > 0, nothing), strict=True))
+    return dict(zip(names, _interpolated(series, clock), strict=True))
+
+
+def _interpolated(series: Series, clock: Int[np.ndarray, "times"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The values on the clock, where they are known, and bounds on their errors. Zero where they are unknown."""
     stamps, periods = series.stamps, np.diff(series.stamps)
     interval = np.clip(np.searchsorted(stamps, clock, side="right") - 1, 0, len(periods) - 1)
     after = (clock - stamps[interval]) / periods[interval]
     change = _around(periods, np.linalg.norm(np.diff(series.values, axis=0), axis=-1))[interval]
+    before, then = series.values[interval], series.values[interval + 1]
+    between = (1 - after)[:, None] * before + after[:, None] * then
+    values = np.where((after == 0)[:, None], before, np.where((after == 1)[:, None], then, between))
     known = (np.isfinite(change) & (after > 0) & (after < 1)) | (after == 0) | (after == 1)
-    mean = (1 - after)[:, None] * series.values[interval] + after[:, None] * series.values[interval + 1]
+    known &= np.isfinite(values).all(axis=-1)
     error = 2 * np.clip(after * (1 - after), 0.0, None) * np.where(np.isfinite(change), change, 0.0)
-    return {
-        "a": np.where(known[:, None], mean, 0.0),
-        "acceleration_known": known,
-        "acceleration_error": np.where(known, error, 0.0),
-    }
+    if series.error is not None:
+        error = error + np.maximum(series.error[interval], series.error[interval + 1])
+    return np.where(known[:, None], values, 0.0), known, np.where(known, error, 0.0)
 
 
 def _mean_velocities(track: Track) -> Float[np.ndarray, "intervals 2"]:

@@ -8,7 +8,8 @@ other,
     x = (1 - l) x_a + l x_b       error <= max(l, 1 - l) |x_b - x_a|
 
 The bound assumes that in between the body is where a point between x_a and x_b is: a correction of the odometry is
-somewhere on its way from one message to the next. The same holds for velocities, which are turned. Samples before a
+somewhere on its way from one message to the next. The same holds for velocities, which are turned. Headings are turned
+without a bound. Samples before a
 link's first message and after its last one are left out.
 
 A topic /r1/tf is that of the namespace r1: its frame base_link is called r1/base_link here, as if the frame itself had
@@ -26,7 +27,7 @@ import numpy as np
 
 from torchfsid.errors import ConfigError, LogError
 from torchfsid.logs.messages import nanoseconds, rotation
-from torchfsid.logs.motion import Motion
+from torchfsid.logs.motion import Motion, heading_of
 
 
 @dataclass
@@ -106,14 +107,15 @@ class Transforms:
             LogError: all links are static, or they share no time.
         """
         at = frame
-        x = np.zeros(3)
+        x, ahead = np.zeros(3), np.array([1.0, 0.0, 0.0])
         while (link := self._link(at, frame)).is_static:
             R, p = link.pose()
-            x, at = R @ x + p, link.parent
+            x, ahead, at = R @ x + p, R @ ahead, link.parent
             if at == self.fixed:
                 raise LogError(f"{self.source}: frame {frame!r} does not move: it is given on tf_static alone")
         stamps, R, p = link.series()
-        return self.in_fixed(link.parent, Motion.exact(stamps, R @ x + p), frame)
+        motion = Motion.exact(stamps, R @ x + p)._replace(heading=np.array(list(map(heading_of, R @ ahead))))
+        return self.in_fixed(link.parent, motion, frame)
 
     def in_fixed(self, frame: str, motion: Motion, origin: str) -> Motion:
         """A motion in a frame, seen from the fixed frame.
@@ -160,7 +162,8 @@ def _moved(motion: Motion, link: _Link) -> Motion:
     """The motion in the parent's frame, without the samples at which the link is unknown."""
     if link.is_static:
         R, p = link.pose()
-        return motion._replace(x=motion.x @ R.T + p, u=None if motion.u is None else motion.u @ R.T)
+        x, u = motion.x @ R.T + p, None if motion.u is None else motion.u @ R.T
+        return motion._replace(x=x, u=u, heading=_turned(motion, R[None]))
     stamps, R, p = link.series()
     inside = (motion.stamps >= stamps[0]) & (motion.stamps <= stamps[-1])
     at = motion.stamps[inside]
@@ -175,7 +178,19 @@ def _moved(motion: Motion, link: _Link) -> Motion:
 
     x, x_error = between(motion.x, p)
     u, u_error = (None, 0.0) if motion.u is None else between(motion.u, np.zeros_like(p))
-    return Motion(at, x, u, motion.position_error[inside] + x_error, motion.velocity_error[inside] + u_error)
+    kept = motion._replace(heading=None if motion.heading is None else motion.heading[inside])
+    turns = (1 - part)[:, None, None] * R[before] + part[:, None, None] * R[after]
+    errors = motion.position_error[inside] + x_error, motion.velocity_error[inside] + u_error
+    return Motion(at, x, u, *errors, heading=_turned(kept, turns))
+
+
+def _turned(motion: Motion, R: np.ndarray) -> np.ndarray | None:
+    """The headings, turned by one R or by one for each sample."""
+    if motion.heading is None:
+        return None
+    ahead = np.stack([np.cos(motion.heading), np.sin(motion.heading)], axis=-1)
+    turned = (R[:, :2, :2] @ ahead[..., None])[..., 0]
+    return np.arctan2(turned[:, 1], turned[:, 0])
 
 
 def namespaces(types: Mapping[str, set[str]], kind: str) -> frozenset[str]:
