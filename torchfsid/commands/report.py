@@ -61,8 +61,8 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
         )
     if observation.declared.contacts:
         console.print(
-            f"{observation.declared.contacts} times a body did not move as its logged velocity says (contacts, perhaps): "
-            "the velocity it arrived with counts as uncertain."
+            f"{observation.declared.contacts} times a body did not move as its logged velocity says (contacts?). "
+            "The velocity it arrived with counts as uncertain."
         )
     if observation.declared.recovery is not None:
         _print_lines([observation.declared.recovery.sentence()], console)
