@@ -205,6 +205,37 @@ def test_poses_at_different_times_are_brought_together(tmp_path):
     np.testing.assert_allclose(found.log.u[known, 0], run.u[: len(known), 0].numpy()[known], atol=np.abs(steps).max())
 
 
+def test_headings_are_turned_into_the_fixed_frame(tmp_path):
+    """Odometry in a frame that is turned and moved, which a transform tells once."""
+    run, yaw = driven("ahead", 4, wheels=False), 0.7
+    c, s = math.cos(yaw), math.sin(yaw)
+    turn = torch.tensor([[c, -s], [s, c]], dtype=torch.float64)
+    places = (run.poses[..., :2] - torch.tensor([1.0, 2.0])) @ turn  # R^T (x - p), written for rows
+    topics: dict[str, list[object]] = {f"/r{j}/odom": [] for j in range(4)}
+    for k, t in enumerate(run.t):
+        for j in range(4):
+            turned = yawed(run.poses[k, j, 2].item() - yaw)
+            topics[f"/r{j}/odom"].append(odometry(round(t * 1e9), places[k, j].tolist(), (0, 0, 0), turned, "odom"))
+    topics["/tf_static"] = [transforms(0, {"odom": (1.0, 2.0)}, "map", yawed(yaw))]
+    bag = {"topics": {f"/r{j}/odom": f"r{j}" for j in range(4)}, "fixed_frame": "map"}
+    settings = config(LOOK, bag=bag)
+    log = DeclaredLog(settings, read_log(write_bag(tmp_path / "bag", topics), settings.bag, heading="theta")).log
+    assert log.u is not None
+    np.testing.assert_allclose(log.u[log.velocity_known], run.u[:-1].numpy()[log.velocity_known], atol=1e-9)
+    np.testing.assert_allclose(log.x, declared(run, LOOK, tmp_path).log.x, atol=1e-9)
+
+
+def test_rounded_poses_have_bounds_of_their_own(tmp_path):
+    run = driven("plain", 4)
+    path = write_poses(tmp_path / "log.csv", run.t, run.poses, digits=4)
+    model = DeclaredLog(config({**SI, **WHEELS}), read_csv(path, "theta"))
+    assert model.log.reading.rounding == pytest.approx({"position": 7.1e-5, "heading": 5e-5}, rel=0.01)
+    assert model.log.velocity_error is not None
+    known = model.log.velocity_known
+    assert (errors(model, run) <= model.log.velocity_error)[known].all()
+    assert known.mean() > 0.9
+
+
 def test_a_body_without_headings_is_no_unicycle(tmp_path):
     """Its velocity is a difference. A unicycle without its heading for a while is not seen for that while."""
     run = driven("ahead", 4, wheels=False)

@@ -62,6 +62,7 @@ def commanded(log: Log, body: UnicycleConfig, position_error: float, heading_err
         ConfigError: the headings cannot be those of unicycles.
         LogError: a difference quotient is not finite.
     """
+    heading_error = heading_error + log.reading.rounding.get("heading", 0.0)
     if isinstance(log, ResampledLog):
         return _resampled(log, body, position_error, heading_error)
     assert log.heading is not None

@@ -30,7 +30,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from torchfsid.errors import LogError
-from torchfsid.logs.quantities import headings_in, quantities_in, radii_in, repeats_in, times_in
+from torchfsid.logs.quantities import heading_in, quantities_in, radii_in, repeats_in, times_in
 from torchfsid.logs.reading import UNITS, Reading
 from torchfsid.logs.tables import CsvTable, ParquetTable, Table, require_column
 
@@ -315,14 +315,13 @@ def _log_in(table: Table, heading: str | None) -> Log:
     bodies = tuple(dict.fromkeys(names))
     slot = {name: j for j, name in enumerate(bodies)}
     body = np.fromiter((slot[name] for name in names), dtype=np.int64, count=len(names))
-    quantities = quantities_in(table, {"position": axes, "velocity": velocities, "acceleration": accelerations})
+    columns = {"position": axes, "velocity": velocities, "acceleration": accelerations, **heading_in(table, heading)}
+    quantities = quantities_in(table, columns)
     place = time * len(bodies) + body
     repeats, same = repeats_in(place, quantities)
     if not same.all():
         i = int(repeats[~same].min())
         raise table.error(i, f"robot {names[i]!r} has another row at t = {t[i]}")
-
-    headings = None if heading is None else headings_in(table, heading)
 
     def by_time_and_body(of_rows: np.ndarray) -> np.ndarray:
         values = np.zeros((time[-1] + 1, len(bodies), *of_rows.shape[1:]), dtype=of_rows.dtype)
@@ -333,7 +332,7 @@ def _log_in(table: Table, heading: str | None) -> Log:
         found = quantities.get(quantity)
         return None if found is None or not found.error.any() else by_time_and_body(found.error)
 
-    positions, u, a = (quantities.get(quantity) for quantity in UNITS)
+    positions, u, a, turned = (quantities.get(quantity) for quantity in [*UNITS, "heading"])
     assert positions is not None
     seen = by_time_and_body(positions.known)
     return Log(
@@ -350,8 +349,8 @@ def _log_in(table: Table, heading: str | None) -> Log:
         a=None if a is None else by_time_and_body(a.values),
         acceleration_known=None if a is None else by_time_and_body(a.known),
         acceleration_error=bounds("acceleration"),
-        heading=None if headings is None else by_time_and_body(np.nan_to_num(headings)),
-        oriented=None if headings is None else by_time_and_body(np.isfinite(headings)),
+        heading=None if turned is None else by_time_and_body(turned.values[:, 0]),
+        oriented=None if turned is None else by_time_and_body(turned.known),
         reading=Reading(
             rounding={name: of.rounding for name, of in quantities.items() if of.rounding > 0}, duplicates=len(repeats)
         ),

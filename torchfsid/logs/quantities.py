@@ -56,15 +56,17 @@ def times_in(table: Table) -> Float[np.ndarray, "rows"]:
     return t
 
 
-def headings_in(table: Table, column: str) -> Float[np.ndarray, "rows"]:
-    """The headings [rad], NaN where the cells are empty.
+def heading_in(table: Table, column: str | None) -> dict[str, list[str]]:
+    """The quantity `heading` and its column [rad], if it is wanted.
 
     Raises:
-        LogError: there is no such column, or a cell is not a number.
+        LogError: there is no such column.
     """
+    if column is None:
+        return {}
     if table.header.count(column) != 1:
         raise table.header_error(f"body.heading: no single {column!r} in the header {reprlib.repr(table.header)}")
-    return table.numbers(column, may_be_empty=True)
+    return {"heading": [column]}
 
 
 def radii_in(table: Table, names: Sequence[str], body: Int[np.ndarray, "rows"]) -> Float[np.ndarray, "bodies"]:

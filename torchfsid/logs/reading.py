@@ -15,6 +15,7 @@ ALL_DIGITS = 17
 """Significant digits of which every double can be read back."""
 
 UNITS = {"position": "m", "velocity": "m/s", "acceleration": "m/s2"}
+ROUNDED = {**UNITS, "heading": "rad"}
 
 
 @dataclass(frozen=True)
@@ -22,8 +23,8 @@ class Reading:
     """What was found while a log was read.
 
     Attributes:
-        rounding: for each quantity of `UNITS` that was rounded when the log was written, the bound on the length of the
-            error, which the log's bounds contain.
+        rounding: for each quantity of `ROUNDED` that was rounded when the log was written, the bound on the length of
+            the error, which the log's bounds contain. That of headings is used where commands are recovered.
         duplicates: the number of samples that were left out because they repeat another one exactly.
         time_origin: what was subtracted from all times [s]. None: nothing.
     """
@@ -41,7 +42,7 @@ class Reading:
     def sentences(self) -> Iterator[str]:
         """The same in words."""
         if self.rounding:
-            sizes = ", ".join(f"{name} {size:.2g} {UNITS[name]}" for name, size in self.rounding.items())
+            sizes = ", ".join(f"{name} {size:.2g} {ROUNDED[name]}" for name, size in self.rounding.items())
             yield f"The log's decimals are rounded; this much is added to the bounds: {sizes}"
         if self.duplicates:
             yield f"{self.duplicates} samples repeat another one exactly, and are left out"
