@@ -113,8 +113,8 @@ def controller_failed(
     A robot's own QP has failed if its control is exactly zero and zero violates one of its `rows`. It may have failed
     if zero violates a row that is wrong by at most its `errors`. A control that is zero within `control_error` may be
     that of a failed QP, too, or of a controller that has switched its barriers off at the goal, if zero violates a row
-    by more than that. A joint QP that fails stops the whole team. So it may have failed whenever all controls are
-    exactly zero.
+    by more than all these errors. A joint QP that fails stops the whole team. So it may have failed whenever all
+    controls are exactly zero.
     """
     assert measurement.u is not None
     error = torch.as_tensor(control_error, dtype=rows.b.dtype, device=rows.b.device)
@@ -123,7 +123,8 @@ def controller_failed(
         return slow
     stopped, sizes = (measurement.u == 0).all(-1), rows.norms()
     least = torch.zeros_like(rows.b) if errors is None else errors.slack * sizes
-    failed = stopped & (rows.b < least).any(-1) | slow & (rows.b < -error.unsqueeze(-1) * sizes).any(-1)
+    clearly = rows.b < -least - error.unsqueeze(-1) * sizes
+    failed = stopped & (rows.b < least).any(-1) | slow & clearly.any(-1)
     perhaps_joint = any(getattr(barrier, "neighbour_velocity", None) in ("current", None) for barrier in barriers)
     controls = measurement.body_velocities if measurement.body_accelerations is None else measurement.body_accelerations
     if perhaps_joint and controls is not None:
