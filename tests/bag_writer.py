@@ -12,8 +12,9 @@ import yaml
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from torchfsid.logs.log import Log, read_csv
+from torchfsid.logs.log import Log
 from torchfsid.logs.messages import ACCELERATION, ODOMETRY, POSE, TRANSFORMS
+from torchfsid.logs.table_log import read_csv
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 TYPES = STORE.types

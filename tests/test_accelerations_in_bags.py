@@ -14,7 +14,7 @@ from torchfsid.config.documents import validate
 from torchfsid.config.observe import ObserveConfig
 from torchfsid.errors import ConfigError, LogError
 from torchfsid.logs.bags import read_bag
-from torchfsid.logs.log import read_csv
+from torchfsid.logs.table_log import read_csv
 
 SECOND = 1_000_000_000
 BODIES = ["ann", "bob", "cyd", "dan", "post"]

@@ -17,9 +17,10 @@ from torchfsid.config.bags import BagConfig
 from torchfsid.config.documents import validate
 from torchfsid.errors import ConfigError, FsidError, LogError
 from torchfsid.logs.bags import read_bag
-from torchfsid.logs.log import Log, read_csv
+from torchfsid.logs.log import Log
 from torchfsid.logs.messages import ODOMETRY, POSE, TRANSFORMS
 from torchfsid.logs.read import read_log
+from torchfsid.logs.table_log import read_csv
 
 CSV = """t,robot,x,y,vx,vy,radius
 0,ann,-1.4999999999999998,0.25,0.12499999999999999,-0.5,0.2

@@ -15,7 +15,7 @@ from torchfsid.commands.declared_log import DeclaredLog
 from torchfsid.commands.terminal import COMPILING
 from torchfsid.config.documents import validate
 from torchfsid.config.observe import ObserveConfig
-from torchfsid.logs.log import read_csv
+from torchfsid.logs.table_log import read_csv
 from torchfsid.observers.consistency import RESOLUTION, SMALLEST
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.outcome import Status

@@ -13,7 +13,7 @@ from experiments.runs.recording import simulate_scene
 from experiments.runs.saved import Results
 from experiments.sweeps.record import observed
 from tests.test_experiments import CONFIGS, finish
-from torchfsid.logs.log import read_csv
+from torchfsid.logs.table_log import read_csv
 
 # ORCA ---------------------------------------------------------------------------------------------------------------
 

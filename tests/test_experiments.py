@@ -22,7 +22,7 @@ from experiments.runs.saved import Results
 from experiments.runs.summary import compare, stays_below, timeline
 from torchfsid.commands.results_folder import write_json
 from torchfsid.config.documents import dump
-from torchfsid.logs.log import read_csv
+from torchfsid.logs.table_log import read_csv
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 SHORT = ("duration=0.2", "snapshots=[0.1]", "expected=[]")

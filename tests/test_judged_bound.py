@@ -14,7 +14,7 @@ from torchfsid.commands.declared_log import DeclaredLog, automatic_bound
 from torchfsid.commands.judged_bound import USELESS, JudgedBound
 from torchfsid.config.documents import validate
 from torchfsid.config.observe import ObserveConfig
-from torchfsid.logs.log import read_csv
+from torchfsid.logs.table_log import read_csv
 from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.simulation import simulate

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from tests.test_logs import GAPS
 from torchfsid.errors import LogError
-from torchfsid.logs.log import read_csv
+from torchfsid.logs.table_log import read_csv
 
 repeatable = settings(deadline=None, derandomize=True)
 

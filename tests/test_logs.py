@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchfsid.errors import LogError
-from torchfsid.logs.log import Log, read_csv
+from torchfsid.logs.log import Log
+from torchfsid.logs.table_log import read_csv
 from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 
 IRSIM = """t,robot,x,y,vx,vy,radius

@@ -10,8 +10,8 @@ from torchfsid.cli import main
 from torchfsid.config.documents import validate
 from torchfsid.config.motion_capture import LogConfig
 from torchfsid.errors import ConfigError, LogError
-from torchfsid.logs.log import read_csv
 from torchfsid.logs.read import read_log
+from torchfsid.logs.table_log import read_csv
 
 T = np.arange(6) / 120
 PATHS = {

@@ -20,7 +20,7 @@ from torchfsid.commands.narrowing import narrowed
 from torchfsid.commands.observe import Observation
 from torchfsid.config.documents import validate
 from torchfsid.config.observe import ObserveConfig
-from torchfsid.logs.log import read_csv
+from torchfsid.logs.table_log import read_csv
 from torchfsid.outcome import Status
 from torchfsid.robots.orca import Orca, OrcaController
 from torchfsid.robots.simulation import simulate

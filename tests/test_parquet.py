@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchfsid.errors import LogError
-from torchfsid.logs.log import Log, read_csv
+from torchfsid.logs.log import Log
 from torchfsid.logs.read import read_log
+from torchfsid.logs.table_log import read_csv
 
 COLUMNS = {
     "t": [0.0, 0.0, 0.1, 0.1],

@@ -16,8 +16,9 @@ from torchfsid.config.bags import BagConfig
 from torchfsid.errors import LogError
 from torchfsid.logs.bags import read_bag
 from torchfsid.logs.gaps import bridged
-from torchfsid.logs.log import Log, read_csv
+from torchfsid.logs.log import Log
 from torchfsid.logs.reading import NEGLIGIBLE, half_units
+from torchfsid.logs.table_log import read_csv
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.outcome import Status
 from torchfsid.robots.avoidance import ClassK, CollisionAvoidance

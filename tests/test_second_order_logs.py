@@ -21,7 +21,7 @@ from torchfsid.config.documents import dump, validate
 from torchfsid.config.models import load_models
 from torchfsid.config.observe import ObserveConfig
 from torchfsid.errors import ConfigError
-from torchfsid.logs.log import read_csv
+from torchfsid.logs.table_log import read_csv
 from torchfsid.robots.simulation import Trajectory
 
 BODIES = ["ann", "bob", "cyd", "dan", "post"]

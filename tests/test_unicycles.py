@@ -17,8 +17,9 @@ from torchfsid.commands.observe import Observation
 from torchfsid.config.documents import validate
 from torchfsid.config.observe import ObserveConfig
 from torchfsid.errors import ConfigError, LogError
-from torchfsid.logs.log import Log, read_csv, read_parquet
+from torchfsid.logs.log import Log
 from torchfsid.logs.read import read_log
+from torchfsid.logs.table_log import read_csv, read_parquet
 
 EXACT = 1e-11
 KINDS = list(MAPS)

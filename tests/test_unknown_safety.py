@@ -19,7 +19,7 @@ from torchfsid.config.documents import validate
 from torchfsid.config.models import dump_models, load_models
 from torchfsid.config.observe import ObserveConfig
 from torchfsid.errors import ConfigError, FigureError
-from torchfsid.logs.log import read_csv
+from torchfsid.logs.table_log import read_csv
 from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.simulation import Trajectory, simulate

@@ -8,8 +8,9 @@ from torchfsid.config.bags import BagConfig
 from torchfsid.config.motion_capture import LogConfig
 from torchfsid.errors import ConfigError, LogError
 from torchfsid.logs.bags import read_bag
-from torchfsid.logs.log import Log, read_csv, read_parquet
+from torchfsid.logs.log import Log
 from torchfsid.logs.motion_capture import read_motion_capture
+from torchfsid.logs.table_log import read_csv, read_parquet
 
 
 def read_log(
