@@ -46,17 +46,17 @@ def measurements(
 
     goals, radius, found = places(), np.full(robots, RADIUS), []
     controller = CbfQpController(task, [ORCA])
+    slots = NEIGHBOURS + (3 if rho else 1)  # bodies beyond them are proved to be no neighbours
     for k in range(steps):
         if k % EPISODE == 0:
             x, before = places(), torch.zeros(robots, 2, dtype=torch.float64)
-        # Three slots more than neighbours: bodies beyond them are proved to be no neighbours.
-        seen = nearest_bodies(STEP * k, x, count=NEIGHBOURS + 3, previous_u=before, radius=radius)
+        seen = nearest_bodies(STEP * k, x, count=slots, previous_u=before, radius=radius)
         began = time.process_time()
         u = controller(seen, goals).u
         spent += time.process_time() - began
         direction = torch.from_numpy(rng.normal(size=(robots, 2)))
         wrong = x + rho * direction / direction.norm(dim=-1, keepdim=True)
-        measured = nearest_bodies(STEP * k, wrong, u, count=NEIGHBOURS + 3, previous_u=before, radius=radius)
+        measured = nearest_bodies(STEP * k, wrong, u, count=slots, previous_u=before, radius=radius)
         found.append(measured)
         x, before = x + STEP * u, u
     return found, goals, 1e6 * spent / robots / steps
@@ -91,7 +91,7 @@ def run(robots: int, steps: int, task: GoalTask, rho: float, ways: dict[str, boo
 def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks orca")
     parser.add_argument("--steps", type=int, default=40)
-    parser.add_argument("--robots", type=int, nargs="+", default=[1000, 10_000])
+    parser.add_argument("--robots", type=int, nargs="+", default=[1000, 4000, 10_000])
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     ways, results = {"compiled": True, "torch": False}, []
