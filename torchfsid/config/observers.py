@@ -67,27 +67,6 @@ class _Errors(Strict):
     neighbour_velocity: NonNegative = 0.0
 
 
-class NoiseConfig(_Errors):
-    """`NoiseBound`: bounds on the errors of a log.
-
-    Attributes:
-        velocity: bound on the error of controls [m/s].
-        slack: bound on the error of slacks [m/s].
-        position: bound on the error of positions [m].
-        neighbour_velocity: bound on the error of other bodies' velocities [m/s].
-    """
-
-    velocity: NonNegative
-
-    def build(self) -> NoiseBound:
-        """The `NoiseBound` with these bounds."""
-        from torchfsid.robots.bounds import NoiseBound
-
-        return NoiseBound(
-            self.velocity, self.slack, self.position, self.neighbour_velocity, arrival=self.neighbour_velocity
-        )
-
-
 Bound = float | Literal["auto"]
 
 
@@ -135,14 +114,21 @@ class _ObservedErrors(_Errors):
         return self.with_control(0.0)._built()
 
     def _built(self) -> NoiseBound:
-        raise NotImplementedError
+        from torchfsid.robots.bounds import NoiseBound
+
+        assert self.control != "auto"
+        others = self.neighbour_velocity
+        return NoiseBound(self.control, self.slack, self.position, others, arrival=others)
 
 
 class ObservedNoiseConfig(_ObservedErrors):
-    """`NoiseConfig` for a log. With `velocity: auto` the bound is determined from the log itself.
+    """`NoiseBound` for a log. With `velocity: auto` the bound on controls is determined from the log itself.
 
     Attributes:
         velocity: bound on the error of controls [m/s], or `auto`.
+        slack: bound on the error of slacks [m/s].
+        position: bound on the error of positions [m].
+        neighbour_velocity: bound on the error of other bodies' velocities, and of the robots' own before t [m/s].
         heading: bound on the error of the headings of unicycles [rad].
     """
 
@@ -155,9 +141,6 @@ class ObservedNoiseConfig(_ObservedErrors):
     @classmethod
     def _is_bound_or_auto(cls, value: object) -> Bound:
         return _bound_or_auto(value, cls.unit)
-
-    def _built(self) -> NoiseBound:
-        return NoiseConfig(**self.model_dump(exclude={"heading"})).build()
 
 
 class AccelerationNoiseConfig(_ObservedErrors):

@@ -166,6 +166,10 @@ class Sample:
     row_errors: RowErrors | None
     corners: Float[Tensor, "B v p"] | None
 
+    def omega_without(self, model: ObservationModel) -> Callable[[Tensor, Tensor], Halfspaces]:
+        """`Evidence.omega_without` of these samples."""
+        return lambda items, rows: read_sample(model, self.without(items, rows), None).omega
+
     def without(self, items: Int[Tensor, "k"], rows: Int[Tensor, "k"]) -> Sample:
         """The samples at the places `items`, as if the row of the same place in `rows` were inactive."""
         k, m = torch.arange(len(items), device=items.device), self.rows.rows
@@ -200,36 +204,13 @@ def evidence(
     return read_sample(model, sample_of(model, theta, measurement.observed_only()), compiled)
 
 
-def by_robot(omega: Halfspaces, t: float | Tensor, robots: int) -> tuple[Halfspaces, float | Tensor]:
-    """The half-spaces of each robot's samples as one set of rows, and their times, for several samples concatenated.
-
-    Args:
-        omega: the half-spaces (samples * robots, R), sample by sample.
-        t: the times of the items [s].
-        robots: the number of robots.
-    """
-    if len(omega.b) == robots:
-        return omega, t.unsqueeze(-1) if isinstance(t, Tensor) and t.ndim > 0 else t
-
-    def gathered(items: Tensor) -> Tensor:
-        return items.unflatten(0, (-1, robots)).transpose(0, 1).flatten(1, 2)
-
-    source = None if omega.source is None else gathered(omega.source)
-    times = torch.as_tensor(t, dtype=torch.float64).expand(len(omega.b)).unsqueeze(-1).expand(-1, omega.rows)
-    return Halfspaces(gathered(omega.A), gathered(omega.b), source), gathered(times)
-
-
 def read_sample(model: ObservationModel, sample: Sample, compiled: bool | None) -> Evidence:
+    """`evidence` of a sample that is already evaluated."""
     return (_compiled if _can_be_compiled(model, sample, compiled) else _in_torch)(model, sample)
 
 
-def _omega_without(
-    model: ObservationModel, sample: Sample, items: Int[Tensor, "k"], rows: Int[Tensor, "k"]
-) -> Halfspaces:
-    return read_sample(model, sample.without(items, rows), None).omega
-
-
 def sample_of(model: ObservationModel, theta: FeasibleSet, measurement: Measurement) -> Sample:
+    """The model at one measurement."""
     assert measurement.u is not None
     robots, items, u = theta.batch_shape.numel(), len(measurement.x), measurement.u.to(torch.float64)
     if measurement.x.ndim != 2 or len(theta.batch_shape) != 1 or items % max(robots, 1) != 0:
@@ -311,8 +292,9 @@ def _in_torch(model: ObservationModel, sample: Sample) -> Evidence:
             model.task.saturation, None if sample.corners is None else sample.corners @ C.mT + d.unsqueeze(-2),
         )  # fmt: skip
     omega = omega.where(informative.unsqueeze(-1))
-    without = partial(_omega_without, model, sample)
-    return Evidence(omega, informative, alarmed, infeasible, slack, excess, sample.hard, solve, without)
+    return Evidence(
+        omega, informative, alarmed, infeasible, slack, excess, sample.hard, solve, sample.omega_without(model)
+    )
 
 
 def _can_be_compiled(model: ObservationModel, sample: Sample, wanted: bool | None) -> bool:
@@ -348,5 +330,6 @@ def _compiled(model: ObservationModel, sample: Sample) -> Evidence:
     informative, alarmed, infeasible, slack, excess = map(torch.from_numpy, judged)
     solved = KktSolution(*map(torch.from_numpy, kkt))
     omega = Halfspaces(*map(torch.from_numpy, rows))
-    without = partial(_omega_without, model, sample)
-    return Evidence(omega, informative, alarmed, infeasible, slack, excess, sample.hard, lambda: solved, without)
+    return Evidence(
+        omega, informative, alarmed, infeasible, slack, excess, sample.hard, lambda: solved, sample.omega_without(model)
+    )

@@ -25,7 +25,8 @@ from torch import Tensor
 
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.identification.evidence import Evidence, ObservationModel, by_robot, evidence
+from torchfsid.identification.by_robot import by_robot
+from torchfsid.identification.evidence import Evidence, ObservationModel, evidence
 from torchfsid.identification.inverse_optimal import per_row
 from torchfsid.outcome import Outcome
 from torchfsid.robots.avoidance_within import AvoidanceWithin, SafetyRows

@@ -33,7 +33,8 @@ from torch import Tensor
 
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.identification.evidence import Evidence, ObservationModel, Sample, by_robot, read_sample, sample_of
+from torchfsid.identification.by_robot import by_robot
+from torchfsid.identification.evidence import Evidence, ObservationModel, Sample, read_sample, sample_of
 from torchfsid.robots.bounds import RowErrors
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.tasks import Saturation

@@ -23,7 +23,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchfsid.identification.evidence import Evidence, ObservationModel, by_robot, evidence
+from torchfsid.identification.by_robot import by_robot
+from torchfsid.identification.evidence import Evidence, ObservationModel, evidence
 from torchfsid.identification.safety_parameters import LearningModel, Possible
 from torchfsid.robots.barriers import Barrier
 from torchfsid.robots.bounds import NoiseBound
