@@ -44,6 +44,7 @@ OBSERVED = (
     File("estimates.csv", "runs.observe", "runs.saved", "a row per time and robot: sizes of sets, estimates"),
     File("regions.jsonl", "runs.observe", "runs.saved", "a line per time and robot: rows, controls, vertices"),
     File("regions.json", "runs.observe", None, "the final sets, rows A theta <= b"),
+    File("sets.csv", "runs.observe", None, "the sets over time, thinned: a row per facet"),
 )
 
 FILES = {
@@ -61,6 +62,7 @@ FILES = {
         CONFIG,
         File("estimates.csv", "runs.swarm", None, "a row per robot at the snapshots: sizes of sets, estimates"),
         File("regions.json", "runs.swarm", None, "the final sets, rows A theta <= b"),
+        File("sets.csv", "runs.swarm", None, "the sets at the snapshots: a row per facet"),
         File("sizes.csv", "runs.swarm", "figures.swarm", "a row per time: quantiles of sizes, shares of robots"),
         File("snapshots.csv", "runs.swarm", "figures.swarm", "a row per robot at the snapshots: place, goal, case"),
         File("summary.json", "__main__", "figures.swarm", "what was lost, how long it took, how much memory"),

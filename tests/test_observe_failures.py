@@ -125,7 +125,9 @@ def test_a_signal_leaves_whole_samples_and_the_sets_so_far(
         ".torchfsid",
         "config.yaml",
         "estimates.csv",
+        "motion.csv",
         "regions.json",
+        "sets.csv",
     }
 
 
@@ -171,7 +173,7 @@ def test_a_table_that_breaks_off_in_a_line_loses_that_sample_and_not_the_sets(
 
     def on_a_small_disk(self: results.ResultsWriter) -> results.ResultsWriter:
         self = enter(self)
-        self._file = Disk(self._file, 700, ended)
+        self._estimates._file = Disk(self._estimates._file, 700, ended)
         return self
 
     monkeypatch.setattr(results.ResultsWriter, "__enter__", on_a_small_disk)
@@ -270,7 +272,8 @@ def test_runs_do_not_mix(observe: Observe, tmp_path: Path, log: Path) -> None:
     assert not (out / "velocity").exists()
     assert (out / "goal" / "regions.json").read_bytes() == of_goal
     assert observe() == 0
-    names = {"config.yaml", "estimates.csv", "regions.json", "regions.png", "regions.pdf", ".torchfsid"}
+    tables = {"estimates.csv", "sets.csv", "motion.csv", "regions.json"}
+    names = {"config.yaml", *tables, "regions.png", "regions.pdf", ".torchfsid"}
     assert {path.name for path in out.iterdir()} == names
 
 

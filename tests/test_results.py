@@ -85,7 +85,12 @@ def test_files_are_written_and_read_where_the_table_says(kind: str):
         for module in filter(None, (file.writer, file.reader)):
             source = (ROOT / "experiments" / (module.replace(".", "/") + ".py")).read_text(encoding="utf-8")
             stem = file.name.split(".")[0]
-            by_package = {"estimates": "ResultsWriter", "regions": "ResultsWriter", "config": "claim"}
+            by_package = {
+                "estimates": "ResultsWriter",
+                "regions": "ResultsWriter",
+                "sets": "ResultsWriter",
+                "config": "claim",
+            }
             assert stem in source or by_package.get(stem, stem) in source, (file.name, module)
 
 
@@ -119,6 +124,7 @@ def test_a_fresh_run_that_is_interrupted_leaves_nothing_of_an_older_one(
         "estimates.csv",
         "regions.json",
         "regions.jsonl",
+        "sets.csv",
         "notes.txt",
     }
     assert left["estimates.csv"].endswith(b"\n")

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
 
 from torchfsid.commands.declared_log import AUTO_FACTOR, DeclaredLog, automatic_bound
+from torchfsid.commands.history import MotionFile
 from torchfsid.commands.judged_bound import JudgedBound
 from torchfsid.commands.narrowing import Narrowing, narrowed
 from torchfsid.commands.results import STATUS_NAMES, ResultsWriter, constraint_name, of_sets, seconds
@@ -155,7 +157,7 @@ class Observation:
         return [robot for robot, strained in zip(self.robots, needs_more.tolist(), strict=True) if strained]
 
     def run(self, out: Path, track: Track = iter) -> None:
-        """Observe the whole log. Write estimates.csv and regions.json into the existing folder `out`.
+        """Observe the whole log. Write what `results` and `history` describe into the existing folder `out`.
 
         With unknown safety parameters the log is then read again (`second_look`), for the sets of regions.json.
 
@@ -165,7 +167,10 @@ class Observation:
         """
         bound, labels = {"used": self.bound_used, **self.bound.to_json()}, self.declared.row_labels
         told = self.log.reading.to_json()
-        with ResultsWriter(out, self.robots, self.sets, labels=labels, bound=bound, log=told) as results:
+        with (
+            ResultsWriter(out, self.robots, self.sets, labels=labels, bound=bound, log=told) as results,
+            closing(MotionFile(out / "motion.csv", self.log, self.robots, labels)) as motion,
+        ):
             for measurement in track(self.declared.measurements()):
                 try:
                     estimate = self.observer.update(measurement)
@@ -173,6 +178,7 @@ class Observation:
                     raise FsidError(self._named(error)) from error
                 results.write(measurement, estimate)
                 sets = of_sets(estimate)
+                motion.see(sets)
                 for robot, case, used in zip(
                     self.robots, sets.kkt.case.tolist(), sets.informative.tolist(), strict=True
                 ):

@@ -24,7 +24,7 @@ from torchfsid.errors import FigureError
 from torchfsid.logs.log import Log
 from torchfsid.logs.read import read_log
 
-FILES = ("estimates.csv", "regions.json", "regions.png", "regions.pdf")
+FILES = ("estimates.csv", "sets.csv", "motion.csv", "regions.json", "regions.png", "regions.pdf")
 """What an observation leaves beside config.yaml."""
 
 UNKNOWN_FILES = ("safety.png", "safety.pdf", "unknown_numbers.json", "task_gain.json")

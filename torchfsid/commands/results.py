@@ -3,6 +3,7 @@
     config.yaml     the resolved configuration, from which the run can be repeated (`results_folder`)
     estimates.csv   one line per robot and time, whole samples only, however the run ends
     regions.json    the final set of every robot, rows A theta <= b
+    sets.csv        the sets over time (`history`)
 
 Columns of estimates.csv: t, robot, case, n_active, then the set's volume, diameter, centre_i (Chebyshev), radius and
 centroid_i, then ukf_i, hybrid_i, status. Further sets follow with their name as prefix. `case` and `n_active` are empty
@@ -13,19 +14,19 @@ distance is the declared safety distance or margin.
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 
 import torch
-from torch import Tensor
 
+from torchfsid.commands.history import SetsFile
 from torchfsid.commands.interruption import uninterrupted
-from torchfsid.commands.results_folder import named, write_json
+from torchfsid.commands.results_folder import write_json
 from torchfsid.commands.safety_results import COLUMNS, Distances, SafetyColumns, refutation, safety, without_repeats
+from torchfsid.commands.table_file import TableFile, number, texts
 from torchfsid.identification.kkt import CASES
 from torchfsid.observers.hybrid import HybridEstimate
 from torchfsid.observers.safety import SafetyObserver, SetObserver
@@ -38,10 +39,10 @@ STATUS_NAMES = {Status.OK: "ok", Status.ALARM: "alarm", Status.INCONSISTENT: "in
 
 
 class ResultsWriter:
-    """Writes estimates.csv during a run, and regions.json on leaving, also if the run is broken off.
+    """Writes estimates.csv and sets.csv during a run, and regions.json on leaving, also if the run is broken off.
 
-    Use it as a context manager. A file that cannot be written (full disk) does not end the run. estimates.csv then
-    stops after its last whole sample, and the error is raised on leaving.
+    Use it as a context manager. A file that cannot be written (full disk) does not end the run: it stops after its
+    last whole sample, and the error is raised on leaving.
 
     Args:
         out: the folder. It is made if it does not exist.
@@ -68,7 +69,6 @@ class ResultsWriter:
         self._told = {name: dict(content) for name, content in (("bound", bound), ("log", log)) if content}
         self._safety = SafetyColumns(observer) if isinstance(observer, SafetyObserver) else None
         self._described = {name: _Descriptions() for name in ("", *others)}
-        self._problem: OSError | None = None
 
     def __enter__(self) -> ResultsWriter:
         self.out.mkdir(parents=True, exist_ok=True)
@@ -77,20 +77,26 @@ class ResultsWriter:
         header += [*([] if self._safety is None else COLUMNS), "status"]
         for prefix in self.others:
             header += [f"{prefix}_{name}" for name in (*set_columns(p), "status")]
-        self._file = (self.out / "estimates.csv").open("wb", buffering=0)
-        self._write_rows([header])
+        self._estimates = TableFile(self.out / "estimates.csv", header)
+        name = partial(constraint_name, labels=self._labels)
+        self._sets = SetsFile(self.out / "sets.csv", self.robots, p, name)
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
         with uninterrupted():
-            self._file.close()
-            try:
-                found = regions(self.robots, self.observer, self._seen, self._labels)
-                write_json(self.out / "regions.json", found | self._told)
-            except OSError as problem:
-                self._problem = self._problem or problem
-        if self._problem is not None:
-            raise self._problem
+            self._sets.finish(self.observer.feasible_set)
+            problems = []
+            for finish in (self._estimates.close, self._sets.close, self._write_regions):
+                try:
+                    finish()
+                except OSError as problem:
+                    problems.append(problem)
+        if problems:
+            raise problems[0]
+
+    def _write_regions(self) -> None:
+        found = regions(self.robots, self.observer, self._seen, self._labels)
+        write_json(self.out / "regions.json", found | self._told)
 
     def write(
         self,
@@ -99,16 +105,14 @@ class ResultsWriter:
         others: Mapping[str, SetEstimate] = MappingProxyType({}),
     ) -> None:
         """Write one line per robot for the time of `estimate`."""
-        if self._problem is not None:
-            return
         sets, blank = of_sets(estimate), [[""] * self.observer.feasible_set.dim] * len(self.robots)
         ukf, hybrid = blank, blank
         if isinstance(estimate, HybridEstimate):
-            ukf, hybrid = _texts(estimate.ukf_estimate.theta), _texts(estimate.theta)
+            ukf, hybrid = texts(estimate.ukf_estimate.theta), texts(estimate.theta)
         observed = measurement.observed
         measured = [True] * len(self.robots) if observed is None else observed.tolist()
         case, n_active, status = sets.kkt.case.tolist(), sets.kkt.n_active.tolist(), sets.status.tolist()
-        described, t = self._described[""](sets.feasible_set), _number(float(estimate.t))
+        described, t = self._described[""](sets.feasible_set), number(float(estimate.t))
         learned: Sequence[Sequence[str]] = [[]] * len(self.robots)
         if self._safety is not None and sets.safety is not None:
             self._seen.see(measurement)
@@ -121,22 +125,9 @@ class ResultsWriter:
             for columns, other_status in extra:
                 row += [*columns[i], STATUS_NAMES[other_status[i]]]
             rows.append(row)
-        self._write_rows(rows)
-
-    def _write_rows(self, rows: Sequence[Sequence[str]]) -> None:
-        """Write all lines or none, even if writing fails or is interrupted."""
-        text = io.StringIO(newline="")
-        csv.writer(text).writerows(rows)
-        content, whole = text.getvalue().encode(), self._file.tell()
-        try:
-            with named(self.out / "estimates.csv"):
-                while content:
-                    content = content[self._file.write(content) :]
-        except BaseException as error:
-            self._file.truncate(whole)
-            if not isinstance(error, OSError):
-                raise
-            self._problem = error
+        self._estimates.write(rows)
+        sizes = [(_value(volume), _value(diameter)) for volume, diameter, *_ in described]
+        self._sets.see(float(estimate.t), sets.feasible_set, sizes)
 
 
 def of_sets(estimate: HybridEstimate | SetEstimate) -> SetEstimate:
@@ -153,7 +144,7 @@ def describe(sets: FeasibleSet) -> list[list[str]]:
     """Volume, diameter, Chebyshev centre and radius, centroid of each set, as text. Empty where a value is NaN."""
     centre, radius = sets.chebyshev()
     columns = [sets.volume()[:, None], sets.diameter()[:, None], centre, radius[:, None], sets.centroid()]
-    return _texts(torch.cat(columns, dim=-1))
+    return texts(torch.cat(columns, dim=-1))
 
 
 class _Descriptions:
@@ -258,10 +249,5 @@ def _indexed(name: str, p: int) -> list[str]:
     return [f"{name}_{i}" for i in range(p)]
 
 
-def _number(value: float) -> str:
-    """The number as text, with 15 significant digits. With 12, map coordinates would end at hundredths of a mm."""
-    return f"{value:.15g}" if math.isfinite(value) else ""
-
-
-def _texts(values: Tensor) -> list[list[str]]:
-    return [[_number(value) for value in row] for row in values.tolist()]
+def _value(text: str) -> float:
+    return float(text) if text else math.nan
