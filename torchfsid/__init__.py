@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from torchfsid.identification.critical_region import critical_region as critical_region
     from torchfsid.identification.inverse_optimal import inverse_optimal_set as inverse_optimal_set
     from torchfsid.identification.kkt import solve_kkt as solve_kkt
+    from torchfsid.kernels.threads import get_num_threads as get_num_threads
+    from torchfsid.kernels.threads import set_num_threads as set_num_threads
+    from torchfsid.observers.fleet import FleetObserver as FleetObserver
     from torchfsid.observers.hybrid import HybridObserver as HybridObserver
     from torchfsid.observers.safety import SafetyObserver as SafetyObserver
     from torchfsid.observers.set_membership import SetMembershipObserver as SetMembershipObserver
@@ -53,6 +56,8 @@ _HOME = {
     "identification.critical_region": ["critical_region"],
     "identification.inverse_optimal": ["inverse_optimal_set"],
     "identification.kkt": ["solve_kkt"],
+    "kernels.threads": ["get_num_threads", "set_num_threads"],
+    "observers.fleet": ["FleetObserver"],
     "observers.hybrid": ["HybridObserver"],
     "observers.safety": ["SafetyObserver"],
     "observers.set_membership": ["SetMembershipObserver"],

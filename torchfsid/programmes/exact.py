@@ -1,7 +1,7 @@
 r"""The two programmes on numpy arrays (B, ...), with the active rows and multipliers that their derivatives need.
 
-They are solved by the kernels. An item whose answer a kernel could not verify is solved again in rational arithmetic
-(`rational`).
+They are solved by the kernels, large batches on several threads. An item whose answer a kernel could not verify is
+solved again in rational arithmetic (`rational`).
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from torchfsid.kernels import implicit
 from torchfsid.kernels import programmes as kernel
+from torchfsid.kernels.threads import over_items
 from torchfsid.programmes import rational
 
 Reals = Indices = Mask = NDArray[Any]  # of float64, int64, bool
@@ -36,7 +37,7 @@ def nearest_point(A: Reals, b: Reals, y: Reals, metric: Reals | None = None) -> 
     z, mu, rows = np.zeros((B, p)), np.zeros((B, p)), np.zeros((B, p), dtype=np.int64)
     filled, status = np.zeros((B, p), dtype=bool), np.zeros(B, dtype=np.int64)
     H = _or_identity(metric, p)
-    kernel.nearest_point(A, b, y, H, z, mu, rows, filled, status)
+    over_items(kernel.nearest_point, A, b, y, H, z, mu, rows, filled, status)
     for i in np.flatnonzero(status == kernel.UNSOLVED):
         status[i] = rational.nearest_point(A[i], b[i], y[i], H[i : i + 1], z[i], mu[i], rows[i], filled[i])
     return z, mu, rows, filled, status
@@ -56,16 +57,17 @@ def inscribed_ball(A: Reals, b: Reals) -> tuple:
     B, _, p = A.shape
     centre, radius = np.zeros((B, p)), np.zeros(B)
     rows, status = np.zeros((B, p + 1), dtype=np.int64), np.zeros(B, dtype=np.int64)
-    kernel.inscribed_ball(A, b, simplex_around(p), centre, radius, rows, status)
+    simplex = simplex_around(p)
+    over_items(lambda A, b, *found: kernel.inscribed_ball(A, b, simplex, *found), A, b, centre, radius, rows, status)
     for i in np.flatnonzero(status == kernel.UNSOLVED):
-        radius[i], status[i] = rational.inscribed_ball(A[i], b[i], simplex_around(p), centre[i], rows[i])
+        radius[i], status[i] = rational.inscribed_ball(A[i], b[i], simplex, centre[i], rows[i])
     return centre, radius, rows, status
 
 
 def solve_active(N: Reals, filled: Mask, pull: Reals, offsets: Reals, metric: Reals | None = None) -> tuple:
     """Solve H z + N' mu = pull, N z = offsets for z and mu, for the first rows of N, `filled`. Others get mu = 0."""
     z, mu = np.zeros_like(pull), np.zeros_like(offsets)
-    implicit.solve_active(N, filled, pull, offsets, _or_identity(metric, N.shape[-1]), z, mu)
+    over_items(implicit.solve_active, N, filled, pull, offsets, _or_identity(metric, N.shape[-1]), z, mu)
     return z, mu
 
 
@@ -74,7 +76,8 @@ def nearest_point_vjp(
 ) -> tuple:
     """The vector-Jacobian products (grad_A, grad_b, grad_y) of the nearest point in the metric I."""
     grad_A, grad_b, grad_y = np.zeros_like(A), np.zeros(A.shape[:2]), np.zeros_like(z)
-    implicit.nearest_point_vjp(A, rows, filled, mu, z, status, grad_z, grad_mu, grad_A, grad_b, grad_y)
+    given, gradients = (A, rows, filled, mu, z, status, grad_z, grad_mu), (grad_A, grad_b, grad_y)
+    over_items(implicit.nearest_point_vjp, *given, *gradients)
     return grad_A, grad_b, grad_y
 
 
@@ -84,7 +87,12 @@ def inscribed_ball_vjp(
     """The vector-Jacobian products (grad_A, grad_b) of the largest ball's centre and radius."""
     grad_A, grad_b = np.zeros_like(A), np.zeros(A.shape[:2])
     simplex = simplex_around(A.shape[2])
-    implicit.inscribed_ball_vjp(A, centre, radius, rows, simplex, grad_centre, grad_radius, grad_A, grad_b)
+    over_items(
+        lambda A, centre, radius, rows, *gradients: implicit.inscribed_ball_vjp(
+            A, centre, radius, rows, simplex, *gradients
+        ),
+        A, centre, radius, rows, grad_centre, grad_radius, grad_A, grad_b,
+    )  # fmt: skip
     return grad_A, grad_b
 
 

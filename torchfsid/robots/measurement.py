@@ -182,8 +182,8 @@ class Measurement:
             raise InputError("measurement.t", "one time for all robots", f"{len(times.unique())} different times")
         return float(times[0])
 
-    def select(self, items: Int[Tensor, "k"] | Bool[Tensor, "B"]) -> Measurement:
-        """The robots at the places `items` of a batch (B,). A place may occur more than once."""
+    def select(self, items: Int[Tensor, "k"] | Bool[Tensor, "B"] | slice) -> Measurement:
+        """The robots at the places `items` of a batch (B,). A place may occur twice. A slice copies nothing."""
         chosen = {}
         for field in fields(self):
             value = getattr(self, field.name)

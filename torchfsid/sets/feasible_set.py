@@ -15,6 +15,7 @@ each other have to be moved outward. All its gradients are zero.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import nan
@@ -208,6 +209,34 @@ class FeasibleSet:
             outcome=self.outcome[items],
             contradiction=Facets(rows, against.time[items], against.source[items]),
             last_cut=self.last_cut[items],
+        )
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[FeasibleSet]) -> FeasibleSet:
+        """Several batches (B,) of sets as one, one after the other.
+
+        Raises:
+            InputError: there are no parts, or they have different dimensions or no batch.
+        """
+        if len({part.dim for part in parts}) != 1 or any(len(part.batch_shape) != 1 for part in parts):
+            expected = "batches (B,) of sets of the same dimension"
+            raise InputError("parts", expected, [(tuple(part.batch_shape), part.dim) for part in parts])
+        places = torch.arange(sum(len(part.outcome) for part in parts), device=parts[0].outcome.device)
+        whole, last = parts[0].select(torch.zeros_like(places)), 0
+        for part in parts:
+            first, last = last, last + len(part.outcome)
+            whole = replace(whole, body=whole.body.replaced(places[first:last], part.body))
+        against = [part.contradiction for part in parts]
+        rows = [facets.halfspaces for facets in against]
+        return replace(
+            whole,
+            outcome=torch.cat([part.outcome for part in parts]),
+            contradiction=Facets(
+                Halfspaces(torch.cat([row.A for row in rows]), torch.cat([row.b for row in rows])),
+                torch.cat([facets.time for facets in against]),
+                torch.cat([facets.source for facets in against]),
+            ),
+            last_cut=torch.cat([part.last_cut for part in parts]),
         )
 
     def emptiness(self) -> Emptiness:
