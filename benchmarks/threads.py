@@ -50,10 +50,10 @@ def layer(kind: type) -> Callable[[int], tuple[float, Tensor]]:
         rows = A.clone().requires_grad_()
         began = time.perf_counter()
         found = kind()(Halfspaces(rows, b), *([3 * point] if kind is ProjectOnto else []))[0]
-        found.square().sum().backward()
+        found.nan_to_num().square().sum().backward()  # NaN: a set without a largest ball
         spent = time.perf_counter() - began
         assert rows.grad is not None
-        return spent, torch.cat([found.detach().flatten(), rows.grad.flatten()])
+        return spent, torch.cat([found.detach().nan_to_num().flatten(), rows.grad.flatten()])
 
     return work
 
