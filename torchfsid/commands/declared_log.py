@@ -132,10 +132,14 @@ class DeclaredLog:
         """A label for each row of the model."""
         return [label for barrier in self.barriers for label in barrier.labels(self.log.bodies)]
 
-    def measurements(self) -> Iterator[Measurement]:
-        """The samples of the robots, in the order of time."""
+    def measurements(self, block: int | None = None) -> Iterator[Measurement]:
+        """The samples of the robots, in the order of time.
+
+        Args:
+            block: how many are concatenated to one measurement. None: each measurement is one sample.
+        """
         uses, required = self.config.neighbour_velocities, self.config.required
-        return self.log.measurements(self.robots, uses, required, self._arrival_errors)
+        return self.log.measurements(self.robots, uses, required, self._arrival_errors, block)
 
     @property
     def contacts(self) -> int:
