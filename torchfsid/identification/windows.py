@@ -32,9 +32,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchfsid.errors import InputError
-from torchfsid.halfspaces import Halfspaces
+from torchfsid.halfspaces import Halfspaces, array
 from torchfsid.identification.by_robot import by_robot
 from torchfsid.identification.evidence import Evidence, ObservationModel, Sample, read_sample, sample_of
+from torchfsid.kernels.directions import extreme_directions
 from torchfsid.robots.bounds import RowErrors
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.tasks import Saturation
@@ -42,9 +43,6 @@ from torchfsid.sets.feasible_set import FeasibleSet
 
 TIME_ROUND_OFF = 1e-6
 """Times of a log count as equal up to this, relative to a window's length."""
-
-AT_ONCE = 1 << 20
-"""Directions of rows that are read at once, which bounds memory."""
 
 AROUND = 16
 """Directions in which the distance of the nominal controls from zero is bounded."""
@@ -196,8 +194,7 @@ class Windows:
             before = torch.cat([torch.zeros_like(values[:1], dtype=torch.long), values.long().cumsum(0)])
             return before[last] == before[first]
 
-        may_be = ~never(series.near)
-        middle, width = _hulls(series, first, count, may_be)
+        middle, width, may_be = _hulls(series, first, count)
         A = torch.stack([middle.cos(), middle.sin()], dim=-1) * may_be.unsqueeze(-1)
         u = (series.x[last] - series.x[first]) / T[..., None, None]
         C, d, drift = mean(series.C), mean(series.d), mean(series.drift)
@@ -224,32 +221,24 @@ class Windows:
 
 
 def _hulls(
-    series: _Moments, first: Int[Tensor, "L S"], count: Int[Tensor, "L S"], may_be: Bool[Tensor, "L S B m"]
-) -> tuple[Float[Tensor, "L S B m"], Float[Tensor, "L S B m"]]:
+    series: _Moments, first: Int[Tensor, "L S"], count: Int[Tensor, "L S"]
+) -> tuple[Float[Tensor, "L S B m"], Float[Tensor, "L S B m"], Bool[Tensor, "L S B m"]]:
     """The middle and the half width of an interval of angles that holds all directions of a row in a window [rad].
 
-    Directions count where the row may be active, among the `count` samples from `first` on. Rows that may not be active
-    at any of them (`may_be`) have zeros.
+    Directions count where the row may be active, among the `count` samples from `first` on. The mask tells where some
+    do. The others have zeros.
     """
-    middle, width = torch.zeros_like(may_be, dtype=torch.float64), torch.zeros_like(may_be, dtype=torch.float64)
-    for k, rows in enumerate(may_be):
-        step = torch.arange(int(count[k].max()), device=count.device)
-        for chosen in rows.nonzero().split(max(1, AT_ONCE // max(1, len(step)))):
-            if len(chosen) == 0:
-                continue
-            s, *row = chosen.unbind(-1)
-            place = (first[k, s].unsqueeze(-1) + step).clamp(max=len(series.t) - 1)
-            angle, half, near = (
-                values[place, row[0].unsqueeze(-1), row[1].unsqueeze(-1)]
-                for values in (series.angle, series.half, series.near)
-            )
-            near = near & (step < count[k, s].unsqueeze(-1))
-            reference = torch.atan2((angle.sin() * near).sum(1), (angle.cos() * near).sum(1))
-            ahead = torch.remainder(angle - reference.unsqueeze(-1) + math.pi, 2 * math.pi) - math.pi
-            high = (ahead + half).masked_fill(~near, -math.inf).amax(1)
-            low = (ahead - half).masked_fill(~near, math.inf).amin(1)
-            middle[k, s, row[0], row[1]], width[k, s, row[0], row[1]] = reference + (high + low) / 2, (high - low) / 2
-    return middle, width
+    searched = extreme_directions(*map(array, (series.angle, series.half, series.near, first, count)))
+    low, high, reference = (torch.from_numpy(part).to(series.angle.device) for part in searched)
+
+    def ahead(samples: Tensor, sign: float) -> Tensor:
+        place = samples.clamp(min=0).flatten(0, 1)
+        angle, half = (values.gather(0, place).view(samples.shape) for values in (series.angle, series.half))
+        return torch.remainder(angle - reference + math.pi, 2 * math.pi) - math.pi + sign * half
+
+    least, greatest, some = ahead(low, -1.0), ahead(high, 1.0), low >= 0
+    middle = torch.where(some, reference + (greatest + least) / 2, 0.0)
+    return middle, torch.where(some, (greatest - least) / 2, 0.0), some
 
 
 def _clipping(

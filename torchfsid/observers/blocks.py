@@ -77,13 +77,6 @@ class Course:
     lost: Bool[Tensor, "S B"] = field(init=False)
     proofs: dict[tuple[int, int], tuple] = field(init=False, default_factory=dict)
 
-    def __post_init__(self) -> None:
-        self.omega = self.omega.shortened()
-        samples, robots = len(self.t), self.levels[-1].batch_shape[0]
-        self.parts, self.which = [self.levels[-1]], torch.arange(robots).repeat(samples, 1)
-        self.explained = torch.ones(samples, robots, dtype=torch.bool)
-        self.lost = torch.zeros(samples, robots, dtype=torch.bool)
-
     def run(self, prior: FeasibleSet | None, proof: Callable[[FeasibleSet, int], tuple]) -> None:
         """Cut the sets by all samples.
 
@@ -91,15 +84,18 @@ class Course:
             prior: what follows an empty set. None: the set as it was.
             proof: called with the sets and the robot, where a set is empty.
         """
-        samples, robots = self.which.shape
+        samples, robots = len(self.t), self.levels[-1].batch_shape[0]
+        every, now = torch.arange(robots), torch.zeros(robots, dtype=torch.long)
+        self.lost = torch.zeros(samples, robots, dtype=torch.bool)
         if samples == 1:  # no search: all robots are cut at once
-            self.explained[0], theta = self._cut(self.omega, self.t, torch.zeros(robots).long(), prior, proof)
-            self.parts = [theta]
+            explains, theta = self._cut(self.omega, self.t.expand(robots), now, prior, proof)
+            self.parts, self.which, self.explained = [theta], every.unsqueeze(0), explains.unsqueeze(0)
             return
-        which, explained = self.which.numpy(), self.explained.numpy()
-        every, known = torch.arange(robots), robots
-        start = torch.zeros(robots, dtype=torch.long)
-        while bool((cut := (now := self._next_cuts(start)) < samples).any()):
+        self.omega = self.omega.shortened()
+        self.parts, self.which = [self.levels[-1]], every.repeat(samples, 1)
+        self.explained = torch.ones_like(self.lost)
+        which, explained, known = self.which.numpy(), self.explained.numpy(), robots
+        while bool((cut := (now := self._next_cuts(now)) < samples).any()):
             items = now.clamp(max=samples - 1) * robots + every
             omega = self.omega.select(items).where(cut.unsqueeze(-1))
             explains, theta = self._cut(omega, self.t[items // robots], now, prior, proof)
@@ -107,7 +103,7 @@ class Course:
             self.parts.append(theta.select(changed))
             for robot, sample in zip(changed.tolist(), now[changed].tolist(), strict=True):
                 which[sample:, robot], explained[sample, robot], known = known, explains[robot], known + 1
-            start = torch.where(cut, now + 1, samples)
+            now = torch.where(cut, now + 1, samples)
 
     def _cut(
         self, omega: Halfspaces, t: Tensor, now: Tensor, prior: FeasibleSet | None, proof: Callable

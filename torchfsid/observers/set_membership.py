@@ -128,8 +128,7 @@ class SetEstimates:
         return len(self.t)
 
     def __getitem__(self, s: int) -> SetEstimate:
-        samples, robots = self.which.shape
-        sets, evidence = self.sets, self.evidence
+        sets, evidence, (samples, robots) = self.sets, self.evidence, self.which.shape
         if samples > 1:
             place = range(samples)[s] * robots
             sets, evidence = sets.select(self.which[s]), evidence.select(torch.arange(place, place + robots))
@@ -216,8 +215,8 @@ class SetMembershipObserver:
     def read(self, samples: Measurement) -> Iterator[SetEstimates]:
         """Take in several measurements of all robots, concatenated in the order of time.
 
-        The sets are those of `update`. What does not depend on the sets is computed for all of them at once, and the estimates come together. Otherwise
-        (`depends_on_theta`) they come one by one. They are computed as they are asked for.
+        The sets are those of `update`. If what the samples say does not depend on the sets (`depends_on_theta`), it is
+        computed for all of them at once, and their estimates come together. Otherwise estimates come one by one.
 
         Raises:
             InputError: see `update`.
@@ -235,24 +234,26 @@ class SetMembershipObserver:
             yield self._take_in(sample)
 
     def _take_in(self, samples: Measurement) -> SetEstimates:
-        times, robots, reset = times_of(samples, len(self.status)), len(self.status), self.on_inconsistent == "reset"
+        robots, reset = len(self.status), self.on_inconsistent == "reset"
+        times = times_of(samples, robots)
+        shape = len(times), robots
         read = partial(evidence, self.model) if self._windows is None else self._windows.read
         found = read(self.feasible_set, samples, self.compiled)
         course = Course((*self._below, self.feasible_set), possible(found) if self.outliers else found.omega, times)
         course.run(self.prior if reset else None, contradicting)
-        alarmed = found.alarmed.unflatten(0, (-1, robots))
-        # Among outliers, alarms empty a level. Those beyond the q empty the last one.
-        lost = course.lost & ~alarmed if self.outliers else course.lost
-        alarmed = alarmed & course.lost if self.outliers else alarmed
-        status = self.status.expand(len(times), -1)
-        if bool(alarmed.any() | lost.any()):
+        alarmed, lost = found.alarmed.view(shape), course.lost
+        if self.outliers:  # alarms among outliers empty a level, those beyond the q the last one
+            alarmed, lost = alarmed & lost, lost & ~alarmed
+        status = self.status.expand(shape)
+        if bool(alarmed.any()) or bool(lost.any()):
             status = self._report(times, alarmed, lost, found.slack, course)
         *below, self.feasible_set = course.levels
         self._below, self.status = tuple(below), status[-1]
-        self.skipped = self.skipped + (~found.informative).unflatten(0, (-1, robots)).sum(0)
-        self.infeasible = self.infeasible + found.infeasible.unflatten(0, (-1, robots)).sum(0)
-        informative = found.informative.unflatten(0, (-1, robots)) & course.explained
-        return SetEstimates(times, joined(course.parts), course.which, found, informative, status)
+        informative = found.informative.view(shape)
+        self.skipped = self.skipped + (~informative).sum(0)
+        self.infeasible = self.infeasible + found.infeasible.view(shape).sum(0)
+        explained = informative & course.explained
+        return SetEstimates(times, joined(course.parts), course.which, found, explained, status)
 
     @property
     def windows_used(self) -> dict[float, float]:
