@@ -101,6 +101,10 @@ class DeclaredLog:
         self.task = config.task.build(self.log.bodies)
         self.barriers = config.build_barriers(self.log.bodies, self._radius)
         self.prior = config.prior.build(len(self.robots))
+        if config.ukf is not False:
+            updates = len(self.log.t) * len(self.robots)
+            chosen = config.ukf.for_log(updates, self.task.saturation is None)
+            self.config = self.config.model_copy(update={"ukf": chosen})
 
     def _require_accelerations(self) -> None:
         if self.log.u is None:

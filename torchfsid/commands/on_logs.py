@@ -62,7 +62,8 @@ def observe_log(path: Path, models: Mapping[str, ObserveConfig], folder: Results
                 write_json(out / "unknown_numbers.json", observation.narrowing.to_json())
                 if "task.gain" in observation.narrowing.numbers:
                     write_json(out / "task_gain.json", observation.narrowing.numbers["task.gain"].to_json())
-            observation.run(out, partial(track, what=f"Observing {name}".strip(), total=observation.samples))
+            what, total = f"Observing {name}".strip(), observation.samples
+            observation.run(out, partial(track, what=what, total=total, size=lambda item: len(item[1])))
             with status("Drawing"):
                 seen = observation.log
                 draw_observation(out, seen.x, seen.seen, seen.bodies)

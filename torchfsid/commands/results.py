@@ -21,6 +21,8 @@ from pathlib import Path
 from types import MappingProxyType, TracebackType
 
 import torch
+from jaxtyping import Int
+from torch import Tensor
 
 from torchfsid.commands.history import SetsFile
 from torchfsid.commands.interruption import uninterrupted
@@ -28,14 +30,16 @@ from torchfsid.commands.results_folder import write_json
 from torchfsid.commands.safety_results import COLUMNS, Distances, SafetyColumns, refutation, safety, without_repeats
 from torchfsid.commands.table_file import TableFile, number, texts
 from torchfsid.identification.kkt import CASES
-from torchfsid.observers.hybrid import HybridEstimate
+from torchfsid.observers.hybrid import HybridEstimate, HybridEstimates
 from torchfsid.observers.safety import SafetyObserver, SetObserver
-from torchfsid.observers.set_membership import SetEstimate, SetMembershipObserver
+from torchfsid.observers.set_membership import SetEstimate, SetEstimates, SetMembershipObserver
 from torchfsid.outcome import Status
 from torchfsid.robots.measurement import Measurement
 from torchfsid.sets.feasible_set import FeasibleSet
 
 STATUS_NAMES = {Status.OK: "ok", Status.ALARM: "alarm", Status.INCONSISTENT: "inconsistent"}
+
+Estimate = SetEstimate | SetEstimates | HybridEstimate | HybridEstimates
 
 
 class ResultsWriter:
@@ -101,38 +105,46 @@ class ResultsWriter:
     def write(
         self,
         measurement: Measurement,
-        estimate: HybridEstimate | SetEstimate,
+        estimate: Estimate,
         others: Mapping[str, SetEstimate] = MappingProxyType({}),
     ) -> None:
-        """Write one line per robot for the time of `estimate`."""
-        sets, blank = of_sets(estimate), [[""] * self.observer.feasible_set.dim] * len(self.robots)
-        ukf, hybrid = blank, blank
-        if isinstance(estimate, HybridEstimate):
-            ukf, hybrid = texts(estimate.ukf_estimate.theta), texts(estimate.theta)
+        """Write one line per robot for the time of the estimate, or for each time of several."""
+        sets = of_sets(estimate)
+        samples, robots = sets.which.shape
+        ukf = hybrid = [[""] * self.observer.feasible_set.dim] * (samples * robots)
+        if isinstance(estimate, HybridEstimate | HybridEstimates):
+            filtered = estimate.ukf_estimate if isinstance(estimate, HybridEstimate) else estimate.ukf_estimates
+            ukf, hybrid = texts(filtered.theta.flatten(0, -2)), texts(estimate.theta.flatten(0, -2))
         observed = measurement.observed
-        measured = [True] * len(self.robots) if observed is None else observed.tolist()
-        case, n_active, status = sets.kkt.case.tolist(), sets.kkt.n_active.tolist(), sets.status.tolist()
-        described, t = self._described[""](sets.feasible_set), number(float(estimate.t))
-        learned: Sequence[Sequence[str]] = [[]] * len(self.robots)
+        measured = [True] * (samples * robots) if observed is None else observed.tolist()
+        case, n_active, status = sets.kkt.case.tolist(), sets.kkt.n_active.tolist(), sets.status.flatten().tolist()
+        described = self._described[""](sets)
+        learned: Sequence[Sequence[str]] = [[]] * (samples * robots)
         if self._safety is not None and sets.safety is not None:
             self._seen.see(measurement)
             learned = self._safety(sets.safety)
-        extra = [(self._described[name](other.feasible_set), other.status.tolist()) for name, other in others.items()]
-        rows = []
-        for i, robot in enumerate(self.robots):
-            active = [CASES[case[i]], str(n_active[i])] if measured[i] else ["", ""]
-            row = [t, robot, *active, *described[i], *ukf[i], *hybrid[i], *learned[i], STATUS_NAMES[status[i]]]
+        extra = [(self._described[name](of_sets(of)), of.status.tolist()) for name, of in others.items()]
+        rows, times = [], [number(t) for t in sets.t.tolist()]
+        for k, place in enumerate(sets.which.flatten().tolist()):
+            active = [CASES[case[k]], str(n_active[k])] if measured[k] else ["", ""]
+            row = [times[k // robots], self.robots[k % robots], *active, *described[place], *ukf[k], *hybrid[k]]
+            row += [*learned[k], STATUS_NAMES[status[k]]]
             for columns, other_status in extra:
-                row += [*columns[i], STATUS_NAMES[other_status[i]]]
+                row += [*columns[k], STATUS_NAMES[other_status[k]]]
             rows.append(row)
         self._estimates.write(rows)
         sizes = [(_value(volume), _value(diameter)) for volume, diameter, *_ in described]
-        self._sets.see(float(estimate.t), sets.feasible_set, sizes)
+        for s in sorted({0, *_changes(sets.which), samples - 1}):
+            at = sets.which[s]
+            self._sets.see(float(sets.t[s]), [sizes[place] for place in at.tolist()], partial(sets.sets.select, at))
 
 
-def of_sets(estimate: HybridEstimate | SetEstimate) -> SetEstimate:
-    """The estimate of the sets alone."""
-    return estimate.set_estimate if isinstance(estimate, HybridEstimate) else estimate
+def of_sets(estimate: Estimate) -> SetEstimates:
+    """The estimates of the sets alone."""
+    if isinstance(estimate, HybridEstimates):
+        return estimate.set_estimates
+    found = estimate.set_estimate if isinstance(estimate, HybridEstimate) else estimate
+    return found if isinstance(found, SetEstimates) else SetEstimates.of(found)
 
 
 def set_columns(p: int) -> list[str]:
@@ -148,21 +160,29 @@ def describe(sets: FeasibleSet) -> list[list[str]]:
 
 
 class _Descriptions:
-    """`describe` for one sample after another. Only sets that have changed are measured again."""
+    """`describe` for estimates, one after the other. Only sets that have changed are measured again."""
 
     def __init__(self) -> None:
         self._texts: list[list[str]] = []
         self._last_cut = torch.empty(0)
 
-    def __call__(self, sets: FeasibleSet) -> list[list[str]]:
-        last_cut = sets.last_cut.nan_to_num(nan=-math.inf)  # a set that is reset is the prior, which was never cut
-        if not self._texts:
-            self._texts = describe(sets)
-        elif len(changed := (last_cut != self._last_cut).nonzero().flatten()):
-            for i, texts in zip(changed.tolist(), describe(sets.select(changed)), strict=True):
-                self._texts[i] = texts
-        self._last_cut = last_cut
-        return self._texts
+    def __call__(self, estimates: SetEstimates) -> list[list[str]]:
+        """The texts of `estimates.sets`. The first ones are sets of all robots."""
+        last_cut = estimates.sets.last_cut.nan_to_num(nan=-math.inf)  # of a set that was reset: never cut
+        known = self._texts + [[]] * (len(last_cut) - len(self._texts))
+        new = torch.ones_like(last_cut, dtype=torch.bool)
+        new[: len(self._last_cut)] = last_cut[: len(self._last_cut)] != self._last_cut
+        if places := new.nonzero().flatten().tolist():
+            for place, text in zip(places, describe(estimates.sets.select(new)), strict=True):
+                known[place] = text
+        final = estimates.which[-1]
+        self._texts, self._last_cut = [known[place] for place in final.tolist()], last_cut[final]
+        return known
+
+
+def _changes(which: Int[Tensor, "S B"]) -> list[int]:
+    """The samples at which some robot's set is another one than before."""
+    return (1 + (which[1:] != which[:-1]).any(-1).nonzero().flatten()).tolist()
 
 
 def seconds(t: float) -> str:

@@ -9,7 +9,7 @@ are cut in the order of time, exactly as if the samples had come one by one.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -25,6 +25,9 @@ from torchfsid.observers.outliers import Levels, narrowed
 from torchfsid.robots.measurement import Measurement
 from torchfsid.sets.around import reach
 from torchfsid.sets.feasible_set import FeasibleSet
+
+FEW = 12
+"""Batches of sets that are joined at a time."""
 
 
 def times_of(samples: Measurement, robots: int) -> Float[Tensor, "S"]:
@@ -49,8 +52,8 @@ def one_by_one(samples: Measurement, robots: int) -> Iterator[Measurement]:
     if len(samples.x) == robots:
         yield samples
         return
-    for items in torch.arange(len(samples.x)).split(robots):
-        yield samples.select(items)
+    for s, t in enumerate(times_of(samples, robots).tolist()):
+        yield replace(samples.select(slice(s * robots, (s + 1) * robots)), t=t)
 
 
 @dataclass
@@ -144,13 +147,7 @@ class Course:
 
 
 def joined(parts: Sequence[FeasibleSet]) -> FeasibleSet:
-    """Several batches (k,) of sets as one."""
-    if len(parts) == 1:
-        return parts[0]
-    half = len(parts) // 2
-    first, second = joined(parts[:half]), joined(parts[half:])
-    a, b = first.batch_shape[0], second.batch_shape[0]
-    place = torch.arange(a + b)
-    return first.select(torch.where(place < a, place, 0)).where(
-        place < a, second.select(torch.where(place < a, 0, place - a))
-    )
+    """Many batches (k,) of sets as one. Few are joined at a time, so that each set is copied a few times only."""
+    while len(parts) > 1:
+        parts = [FeasibleSet.concatenate(parts[k : k + FEW]) for k in range(0, len(parts), FEW)]
+    return parts[0]

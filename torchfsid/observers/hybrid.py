@@ -121,14 +121,13 @@ class HybridObserver:
             InconsistentError: see `SetMembershipObserver.read`.
         """
         robots, first = len(self.ukf.mean), 0
-        if isinstance(self.sets, SafetyObserver) or self.feedback:
+        if self.feedback and len(samples.x) > robots:
             for sample in one_by_one(samples, robots):
-                yield self._with_filter(SetEstimates.of(self.sets.update(sample)), sample)
+                yield from self.read(sample)
             return
         for set_estimates in self.sets.read(samples):
             end = first + len(set_estimates) * robots
-            whole = first == 0 and end == len(samples.x)
-            yield self._with_filter(set_estimates, samples if whole else samples.select(torch.arange(first, end)))
+            yield self._with_filter(set_estimates, samples.select(slice(first, end)))
             first = end
 
     def _with_filter(self, set_estimates: SetEstimates, samples: Measurement) -> HybridEstimates:

@@ -124,6 +124,11 @@ class SetEstimates:
             estimate.safety,
         )
 
+    @property
+    def kkt(self) -> KktSolution:
+        """See `SetEstimate`, for the S*B samples."""
+        return self.evidence.kkt
+
     def __len__(self) -> int:
         return len(self.t)
 
