@@ -19,7 +19,7 @@ from torchfsid.logs.commanded import Recovery, commanded
 from torchfsid.logs.contacts import arrival_errors
 from torchfsid.logs.gaps import bridged
 from torchfsid.logs.log import Log
-from torchfsid.observers.consistency import Consistency
+from torchfsid.observers.consistency import BLOCK, Consistency
 from torchfsid.robots.barriers import Barrier
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.tasks import Task
@@ -161,8 +161,7 @@ class DeclaredLog:
     def consistency(self) -> Consistency:
         """What the log says about the bound on controls, under the model and all other declared bounds."""
         noise = self.config.noise
-        samples = list(self.measurements())
-        return Consistency(samples, self.task, self.barriers, self.prior, noise.slack, noise.build_others())
+        return Consistency(_Blocks(self), self.task, self.barriers, self.prior, noise.slack, noise.build_others())
 
     def shifted(self, samples: int) -> DeclaredLog:
         """The same log with controls taken this number of samples later."""
@@ -233,6 +232,16 @@ class DeclaredLog:
         """
         consistency = self.consistency()
         return dict(zip(self.robots, consistency.smallest_bounds(consistency.fastest).tolist(), strict=True))
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """The samples of a log in blocks, made again whenever they are iterated over."""
+
+    declared: DeclaredLog
+
+    def __iter__(self) -> Iterator[Measurement]:
+        return self.declared.measurements(BLOCK)
 
 
 def automatic_bound(smallest: Mapping[str, float], quantity: str = "velocity") -> float:

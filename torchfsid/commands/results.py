@@ -15,20 +15,21 @@ distance is the declared safety distance or margin.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType, TracebackType
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchfsid.commands.history import SetsFile
 from torchfsid.commands.interruption import uninterrupted
 from torchfsid.commands.results_folder import write_json
 from torchfsid.commands.safety_results import COLUMNS, Distances, SafetyColumns, refutation, safety, without_repeats
-from torchfsid.commands.table_file import TableFile, number, texts
+from torchfsid.commands.table_file import TableFile, line_of, lines_of, number
 from torchfsid.identification.kkt import CASES
 from torchfsid.observers.hybrid import HybridEstimate, HybridEstimates
 from torchfsid.observers.safety import SafetyObserver, SetObserver
@@ -70,6 +71,7 @@ class ResultsWriter:
     ):
         self.out, self.robots, self.observer, self.others = out, list(robots), observer, others
         self._labels, self._seen = labels, Distances()
+        self._names = [line_of([robot]) for robot in self.robots]
         self._told = {name: dict(content) for name, content in (("bound", bound), ("log", log)) if content}
         self._safety = SafetyColumns(observer) if isinstance(observer, SafetyObserver) else None
         self._described = {name: _Descriptions() for name in ("", *others)}
@@ -111,32 +113,32 @@ class ResultsWriter:
         """Write one line per robot for the time of the estimate, or for each time of several."""
         sets = of_sets(estimate)
         samples, robots = sets.which.shape
-        ukf = hybrid = [[""] * self.observer.feasible_set.dim] * (samples * robots)
+        items, p = samples * robots, self.observer.feasible_set.dim
+        ukf = hybrid = ["," * (p - 1)] * items
         if isinstance(estimate, HybridEstimate | HybridEstimates):
             filtered = estimate.ukf_estimate if isinstance(estimate, HybridEstimate) else estimate.ukf_estimates
-            ukf, hybrid = texts(filtered.theta.flatten(0, -2)), texts(estimate.theta.flatten(0, -2))
+            ukf, hybrid = lines_of(filtered.theta.flatten(0, -2)), lines_of(estimate.theta.flatten(0, -2))
         observed = measurement.observed
-        measured = [True] * (samples * robots) if observed is None else observed.tolist()
-        case, n_active, status = sets.kkt.case.tolist(), sets.kkt.n_active.tolist(), sets.status.flatten().tolist()
+        measured = [True] * items if observed is None else observed.tolist()
+        cases = zip(sets.kkt.case.tolist(), sets.kkt.n_active.tolist(), measured, strict=True)
+        active = [f"{CASES[case]},{n}" if seen else "," for case, n, seen in cases]
         described = self._described[""](sets)
-        learned: Sequence[Sequence[str]] = [[]] * (samples * robots)
+        names = [STATUS_NAMES[status] for status in sets.status.flatten().tolist()]
         if self._safety is not None and sets.safety is not None:
             self._seen.see(measurement)
-            learned = self._safety(sets.safety)
-        extra = [(self._described[name](of_sets(of)), of.status.tolist()) for name, of in others.items()]
-        rows, times = [], [number(t) for t in sets.t.tolist()]
-        for k, place in enumerate(sets.which.flatten().tolist()):
-            active = [CASES[case[k]], str(n_active[k])] if measured[k] else ["", ""]
-            row = [times[k // robots], self.robots[k % robots], *active, *described[place], *ukf[k], *hybrid[k]]
-            row += [*learned[k], STATUS_NAMES[status[k]]]
-            for columns, other_status in extra:
-                row += [*columns[k], STATUS_NAMES[other_status[k]]]
-            rows.append(row)
-        self._estimates.write(rows)
-        sizes = [(_value(volume), _value(diameter)) for volume, diameter, *_ in described]
+            names = [line_of([*cells, name]) for cells, name in zip(self._safety(sets.safety), names, strict=True)]
+        for prefix, other in others.items():
+            of_other = zip(names, self._described[prefix](of_sets(other)), other.status.tolist(), strict=True)
+            names = [f"{name},{cells.text},{STATUS_NAMES[status]}" for name, cells, status in of_other]
+        heads = [f"{number(t)},{name}" for t in sets.t.tolist() for name in self._names]
+        places = (described[place].text for place in sets.which.flatten().tolist())
+        rows = zip(heads, active, places, ukf, hybrid, names, strict=True)
+        self._estimates.write_text("".join([",".join(row) + "\r\n" for row in rows]))
         for s in sorted({0, *_changes(sets.which), samples - 1}):
             at = sets.which[s]
-            self._sets.see(float(sets.t[s]), [sizes[place] for place in at.tolist()], partial(sets.sets.select, at))
+            self._sets.see(
+                float(sets.t[s]), [described[place][:2] for place in at.tolist()], partial(sets.sets.select, at)
+            )
 
 
 def of_sets(estimate: Estimate) -> SetEstimates:
@@ -152,32 +154,41 @@ def set_columns(p: int) -> list[str]:
     return ["volume", "diameter", *_indexed("centre", p), "radius", *_indexed("centroid", p)]
 
 
-def describe(sets: FeasibleSet) -> list[list[str]]:
-    """Volume, diameter, Chebyshev centre and radius, centroid of each set, as text. Empty where a value is NaN."""
+def describe(sets: FeasibleSet) -> Float[Tensor, "B columns"]:
+    """Volume, diameter, Chebyshev centre and radius, centroid of each set."""
     centre, radius = sets.chebyshev()
-    columns = [sets.volume()[:, None], sets.diameter()[:, None], centre, radius[:, None], sets.centroid()]
-    return texts(torch.cat(columns, dim=-1))
+    return torch.cat([sets.volume()[:, None], sets.diameter()[:, None], centre, radius[:, None], sets.centroid()], -1)
+
+
+class _Description(NamedTuple):
+    """A set in numbers: its size, and the text of all of `describe`."""
+
+    volume: float
+    diameter: float
+    text: str
 
 
 class _Descriptions:
-    """`describe` for estimates, one after the other. Only sets that have changed are measured again."""
+    """Descriptions of estimates, one after the other. Only sets that have changed are measured again."""
 
     def __init__(self) -> None:
-        self._texts: list[list[str]] = []
+        self._known: list[_Description] = []
         self._last_cut = torch.empty(0)
 
-    def __call__(self, estimates: SetEstimates) -> list[list[str]]:
-        """The texts of `estimates.sets`. The first ones are sets of all robots."""
+    def __call__(self, estimates: SetEstimates) -> list[_Description]:
+        """The descriptions of `estimates.sets`, of which the first ones are those of all robots."""
         last_cut = estimates.sets.last_cut.nan_to_num(nan=-math.inf)  # of a set that was reset: never cut
-        known = self._texts + [[]] * (len(last_cut) - len(self._texts))
-        new = torch.ones_like(last_cut, dtype=torch.bool)
-        new[: len(self._last_cut)] = last_cut[: len(self._last_cut)] != self._last_cut
-        if places := new.nonzero().flatten().tolist():
-            for place, text in zip(places, describe(estimates.sets.select(new)), strict=True):
-                known[place] = text
+        new, robots = torch.ones_like(last_cut, dtype=torch.bool), len(self._last_cut)
+        new[:robots] = last_cut[:robots] != self._last_cut
+        fresh: Iterator[_Description] = iter(())
+        if bool(new.any()):
+            values = describe(estimates.sets.select(new))
+            sizes = values[:, :2].tolist()
+            fresh = (_Description(*size, text) for size, text in zip(sizes, lines_of(values), strict=True))
+        found = [next(fresh) if is_new else self._known[k] for k, is_new in enumerate(new.tolist())]
         final = estimates.which[-1]
-        self._texts, self._last_cut = [known[place] for place in final.tolist()], last_cut[final]
-        return known
+        self._known, self._last_cut = [found[place] for place in final.tolist()], last_cut[final]
+        return found
 
 
 def _changes(which: Int[Tensor, "S B"]) -> list[int]:
@@ -267,7 +278,3 @@ def regions(
 
 def _indexed(name: str, p: int) -> list[str]:
     return [f"{name}_{i}" for i in range(p)]
-
-
-def _value(text: str) -> float:
-    return float(text) if text else math.nan

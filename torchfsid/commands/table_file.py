@@ -37,11 +37,15 @@ class TableFile:
 
     def write(self, lines: Sequence[Sequence[str]]) -> None:
         """Write all lines or none, even if writing fails or is interrupted."""
-        if self.problem is not None:
-            return
         text = io.StringIO(newline="")
         csv.writer(text).writerows(lines)
-        content, whole = text.getvalue().encode(), self._file.tell()
+        self.write_text(text.getvalue())
+
+    def write_text(self, text: str) -> None:
+        """Write lines that are CSV already (`line_of`), all or none."""
+        if self.problem is not None:
+            return
+        content, whole = text.encode(), self._file.tell()
         try:
             with named(self.path):
                 while content:
@@ -69,6 +73,21 @@ def number(value: float) -> str:
     With 12 digits map coordinates would end at hundredths of a millimetre.
     """
     return f"{value:.15g}" if math.isfinite(value) else ""
+
+
+def line_of(cells: Sequence[str]) -> str:
+    """The cells as a part of a line."""
+    text = io.StringIO(newline="")
+    csv.writer(text, lineterminator="").writerow(cells)
+    return text.getvalue()
+
+
+def lines_of(values: Tensor) -> list[str]:
+    """The numbers (rows, columns) as text, each row as a part of a line."""
+    if not bool(values.isfinite().all()):
+        return [",".join(row) for row in texts(values)]
+    form = ",".join(["%.15g"] * values.shape[-1])
+    return [form % tuple(row) for row in values.tolist()]
 
 
 def texts(values: Tensor) -> list[list[str]]:
