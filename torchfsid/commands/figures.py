@@ -8,7 +8,7 @@ import json
 import math
 import warnings
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -79,7 +79,8 @@ def draw_observation(out: Path, x: np.ndarray, seen: np.ndarray, bodies: Sequenc
         FigureError: a file is missing or damaged, or matplotlib fails.
         OSError: a figure cannot be written.
     """
-    final, history = _regions(out / "regions.json"), _history(out / "estimates.csv")
+    final = _regions(out / "regions.json")
+    history = _history(out / "estimates.csv", final)
 
     def draw(figure: Figure) -> None:
         grid = figure.add_gridspec(2, 2, width_ratios=(1.25, 1), height_ratios=(2.2, 1))
@@ -129,16 +130,23 @@ def _regions(path: Path) -> dict[str, Any]:
         raise FigureError(f"{path}: missing or damaged: {one_line(error)}") from error
 
 
-def _history(path: Path) -> dict[str, dict[str, np.ndarray]]:
-    """For each robot: times [s], diameters (NaN if the set is empty) and indices of cases (NaN if not measured)."""
+def _history(path: Path, robots: Collection[str]) -> dict[str, dict[str, np.ndarray]]:
+    """For each robot: times [s], diameters (NaN if the set is empty) and indices of cases (NaN if not measured).
+
+    The times are thinned while they are read: what is not drawn is not parsed.
+    """
     columns: dict[str, tuple[list[float], list[float], list[float]]] = defaultdict(lambda: ([], [], []))
     number = {"": math.nan, **{case: float(i) for i, case in enumerate(CASES)}}
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.reader(file)
-            header = next(reader)
+            lines = sum(len(list(io.StringIO(f"{name}.", newline=""))) for name in robots)  # a name may have several
+            times = (sum(1 for _ in file) - 1) // max(1, lines)
+            file.seek(0)
+            header = next(csv.reader(file))
             robot, *wanted = (header.index(name) for name in ("robot", "t", "diameter", "case"))
-            for row in reader:
+            drawn = set(thinned(np.arange(times)).tolist())
+            kept = (line for k, line in enumerate(file) if k // max(1, lines) in drawn or k >= times * lines)
+            for row in csv.reader(kept):
                 t, diameter, case = (row[i] for i in wanted)
                 of_robot = columns[row[robot]]
                 of_robot[0].append(float(t))
