@@ -30,6 +30,7 @@ from torchfsid.commands.interruption import uninterrupted
 from torchfsid.commands.results_folder import write_json
 from torchfsid.commands.safety_results import COLUMNS, Distances, SafetyColumns, refutation, safety, without_repeats
 from torchfsid.commands.table_file import TableFile, line_of, lines_of, number
+from torchfsid.halfspaces import array
 from torchfsid.identification.kkt import CASES
 from torchfsid.observers.hybrid import HybridEstimate, HybridEstimates
 from torchfsid.observers.safety import SafetyObserver, SetObserver
@@ -119,19 +120,19 @@ class ResultsWriter:
             filtered = estimate.ukf_estimate if isinstance(estimate, HybridEstimate) else estimate.ukf_estimates
             ukf, hybrid = lines_of(filtered.theta.flatten(0, -2)), lines_of(estimate.theta.flatten(0, -2))
         observed = measurement.observed
-        measured = [True] * items if observed is None else observed.tolist()
-        cases = zip(sets.kkt.case.tolist(), sets.kkt.n_active.tolist(), measured, strict=True)
+        measured = [True] * items if observed is None else array(observed).tolist()
+        cases = zip(*(array(of).tolist() for of in (sets.kkt.case, sets.kkt.n_active)), measured, strict=True)
         active = [f"{CASES[case]},{n}" if seen else "," for case, n, seen in cases]
         described = self._described[""](sets)
-        names = [STATUS_NAMES[status] for status in sets.status.flatten().tolist()]
+        names = [STATUS_NAMES[status] for status in array(sets.status.flatten()).tolist()]
         if self._safety is not None and sets.safety is not None:
             self._seen.see(measurement)
             names = [line_of([*cells, name]) for cells, name in zip(self._safety(sets.safety), names, strict=True)]
         for prefix, other in others.items():
             of_other = zip(names, self._described[prefix](of_sets(other)), other.status.tolist(), strict=True)
             names = [f"{name},{cells.text},{STATUS_NAMES[status]}" for name, cells, status in of_other]
-        heads = [f"{number(t)},{name}" for t in sets.t.tolist() for name in self._names]
-        places = (described[place].text for place in sets.which.flatten().tolist())
+        heads = [f"{t},{name}" for t in map(number, sets.t.tolist()) for name in self._names]
+        places = (described[place].text for place in array(sets.which.flatten()).tolist())
         rows = zip(heads, active, places, ukf, hybrid, names, strict=True)
         self._estimates.write_text("".join([",".join(row) + "\r\n" for row in rows]))
         for s in sorted({0, *_changes(sets.which), samples - 1}):
