@@ -111,10 +111,11 @@ class MotionFile(TableFile):
                 continue
             known = log.u is not None and log.velocity_known[k, j]
             velocity = [number(v) for v in log.u[k, j]] if known and log.u is not None else unknown
-            position, rows = [number(x) for x in log.x[k, j]], []
+            position = [number(x) for x in log.x[k, j]]
+            rows: list[int] = []
             if body in self._place:
                 rows = active[place + self._place[body]].nonzero().flatten().tolist()
-            names = "; ".join(self._labels[row] for row in rows)
+            names = "; ".join([self._labels[row] for row in rows])
             yield [number(log.t[k]), body, *position, *velocity, names]
 
 

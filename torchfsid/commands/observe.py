@@ -39,6 +39,12 @@ BLOCK_UPDATES = 2000
 Estimated = tuple[Measurement, SetEstimates | HybridEstimates]
 """Samples, and the estimates after each of them."""
 
+
+def times_in(item: Estimated) -> int:
+    """The number of samples."""
+    return len(item[1])
+
+
 Track = Callable[[Iterable[Estimated]], Iterable[Estimated]]
 """Passes estimates on, and shows how far they have come."""
 

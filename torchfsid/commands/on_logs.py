@@ -13,7 +13,7 @@ from torchfsid.commands.command_line import use_one_thread
 from torchfsid.commands.declared_log import AUTO_FACTOR, DeclaredLog
 from torchfsid.commands.figures import draw_observation
 from torchfsid.commands.hypotheses import Hypotheses
-from torchfsid.commands.observe import Observation
+from torchfsid.commands.observe import Observation, times_in
 from torchfsid.commands.results_folder import ResultsFolder, write_json, write_whole
 from torchfsid.commands.safety_figure import draw_safety
 from torchfsid.commands.terminal import console, status, track
@@ -63,7 +63,7 @@ def observe_log(path: Path, models: Mapping[str, ObserveConfig], folder: Results
                 if "task.gain" in observation.narrowing.numbers:
                     write_json(out / "task_gain.json", observation.narrowing.numbers["task.gain"].to_json())
             what, total = f"Observing {name}".strip(), observation.samples
-            observation.run(out, partial(track, what=what, total=total, size=lambda item: len(item[1])))
+            observation.run(out, partial(track, what=what, total=total, size=times_in))
             with status("Drawing"):
                 seen = observation.log
                 draw_observation(out, seen.x, seen.seen, seen.bodies)

@@ -184,8 +184,8 @@ class _Descriptions:
         fresh: Iterator[_Description] = iter(())
         if bool(new.any()):
             values = describe(estimates.sets.select(new))
-            sizes = values[:, :2].tolist()
-            fresh = (_Description(*size, text) for size, text in zip(sizes, lines_of(values), strict=True))
+            columns = values[:, 0].tolist(), values[:, 1].tolist(), lines_of(values)
+            fresh = map(_Description, *columns)
         found = [next(fresh) if is_new else self._known[k] for k, is_new in enumerate(new.tolist())]
         final = estimates.which[-1]
         self._known, self._last_cut = [found[place] for place in final.tolist()], last_cut[final]

@@ -50,9 +50,6 @@ from torchfsid.tolerances import ACTIVE_TOLERANCE, RELAXED_OPENING, ROUND_OFF
 NO_CLIP = (np.empty(0), False, 0.0, np.empty((0, 0, 2)))
 """`clip` of `kernels.evidence` for nominal controls that are not clipped."""
 
-LARGEST_THETA = 1e9
-"""Larger than any parameter, to find out what depends on them."""
-
 SetKind = Literal["critical_region", "inverse_optimal"]
 
 
@@ -210,22 +207,6 @@ def evidence(
 def read_sample(model: ObservationModel, sample: Sample, compiled: bool | None) -> Evidence:
     """`evidence` of a sample that is already evaluated."""
     return (_compiled if _can_be_compiled(model, sample, compiled) else _in_torch)(model, sample)
-
-
-def depends_on_theta(model: ObservationModel, measurement: Measurement) -> bool:
-    """Does what a measurement says depend on the sets so far?
-
-    A bound on the drift of C theta + d is no smaller for larger theta. If it is the same for theta = 0 as for all theta
-    of the largest numbers, it does not depend on theta.
-    """
-    if model.task.saturation is not None or getattr(model.task, "uncertain", False):
-        return True
-    errors = ErrorBounds.of(measurement, model.noise)
-    if errors is None:
-        return False
-    nothing = measurement.x.new_zeros(len(measurement.x), len(model.task.parameter_names))
-    bounds = (model.task.drift(errors, size) for size in (nothing, torch.full_like(nothing, LARGEST_THETA)))
-    return not torch.equal(*bounds)
 
 
 def sample_of(model: ObservationModel, theta: FeasibleSet, measurement: Measurement) -> Sample:

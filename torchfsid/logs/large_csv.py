@@ -47,7 +47,8 @@ def _large_table(source: str) -> LargeCsvTable | None:
     names = first.decode("ascii").strip("\r").split(",")
     if not first.strip() or len(set(names)) < len(names):
         return None
-    options = csv.ConvertOptions(column_types=dict.fromkeys(names, string()), strings_can_be_null=False)
+    texts = dict.fromkeys(names, string())
+    options = csv.ConvertOptions(column_types=texts, strings_can_be_null=True, null_values=[""])
     try:
         cells = csv.read_csv(BufferReader(content), convert_options=options)
     except ArrowInvalid:
@@ -76,16 +77,15 @@ class LargeCsvTable:
         return checked_names(self, column, [name.strip() for name in self._texts(column)])
 
     def numbers(self, column: str, may_be_empty: bool = False) -> Float[np.ndarray, "rows"]:
-        from pyarrow import ArrowInvalid, compute, float64, scalar, string
+        from pyarrow import ArrowInvalid, float64
 
         cells = self._column(column)
-        if may_be_empty:
-            cells = compute.if_else(compute.equal(cells, ""), scalar(None, string()), cells)
         try:
             values = cells.cast(float64()).to_numpy(zero_copy_only=False)
         except ArrowInvalid:
             return self._plain.numbers(column, may_be_empty)
-        if not (is_measurable(values) | cells.is_null().to_numpy(zero_copy_only=False)).all():
+        empty = np.isnan(values) if cells.null_count else np.zeros(len(values), dtype=bool)
+        if not (is_measurable(values) | (empty & may_be_empty)).all() or empty.sum() != cells.null_count:
             return self._plain.numbers(column, may_be_empty)
         return values
 
@@ -97,4 +97,5 @@ class LargeCsvTable:
 
     def _texts(self, column: str) -> Iterator[str]:
         for chunk in self._cells.column(self.header.index(column)).chunks:
-            yield from chunk.to_pylist()
+            for cell in chunk.to_pylist():
+                yield cell or ""

@@ -20,14 +20,35 @@ from torch import Tensor
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, array
 from torchfsid.identification.by_robot import by_robot
+from torchfsid.identification.evidence import ObservationModel
 from torchfsid.kernels.first_cuts import first_cuts
 from torchfsid.observers.outliers import Levels, narrowed
+from torchfsid.robots.bounds import ErrorBounds
 from torchfsid.robots.measurement import Measurement
 from torchfsid.sets.around import reach
 from torchfsid.sets.feasible_set import FeasibleSet
 
+LARGEST_THETA = 1e9
+"""Larger than any parameter, to find out what depends on them."""
+
 FEW = 12
 """Batches of sets that are joined at a time."""
+
+
+def depends_on_theta(model: ObservationModel, measurement: Measurement) -> bool:
+    """Does what a measurement says depend on the sets so far?
+
+    A bound on the drift of C theta + d is no smaller for larger theta. If it is the same for theta = 0 as for all theta
+    of the largest numbers, it does not depend on theta.
+    """
+    if model.task.saturation is not None or getattr(model.task, "uncertain", False):
+        return True
+    errors = ErrorBounds.of(measurement, model.noise)
+    if errors is None:
+        return False
+    nothing = measurement.x.new_zeros(len(measurement.x), len(model.task.parameter_names))
+    bounds = (model.task.drift(errors, size) for size in (nothing, torch.full_like(nothing, LARGEST_THETA)))
+    return not torch.equal(*bounds)
 
 
 def times_of(samples: Measurement, robots: int) -> Float[Tensor, "S"]:

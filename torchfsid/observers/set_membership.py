@@ -27,10 +27,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchfsid.errors import InconsistentError, InputError
-from torchfsid.identification.evidence import Evidence, ObservationModel, SetKind, depends_on_theta, evidence
+from torchfsid.identification.evidence import Evidence, ObservationModel, SetKind, evidence
 from torchfsid.identification.kkt import KktSolution
 from torchfsid.identification.windows import Windows
-from torchfsid.observers.blocks import Course, joined, one_by_one, times_of
+from torchfsid.observers.blocks import Course, depends_on_theta, joined, one_by_one, times_of
 from torchfsid.observers.outliers import SetAside, possible, set_aside
 from torchfsid.outcome import Status
 from torchfsid.robots.barriers import Barrier

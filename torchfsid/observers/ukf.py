@@ -214,12 +214,12 @@ class ParameterUkf:
         status, start = np.empty((samples, robots), dtype=np.int64), np.zeros(robots, dtype=np.int64)
         while (start < samples).any():
             start = advance(start, *state, *inputs, theta, covariance, status)
-            for i in np.flatnonzero(start < samples):
-                s = start[i]
+            for i in np.flatnonzero(start < samples).tolist():
+                s = int(start[i])
                 kalman = self.filters[i] = self._start(i, x[s, i])
                 kalman.x, kalman.P = mean[i].copy(), P[i].copy()
                 self._motions[i] = motions[(s - 1) * robots + i] if s > 0 else self._motions[i]
-                status[s, i] = self._update_robot(i, steps[s], x[s, i])
+                status[s, i] = self._update_robot(i, float(steps[s]), x[s, i])
                 kalman = self.filters[i]
                 assert kalman is not None
                 mean[i], P[i], running[i] = kalman.x, kalman.P, known[s, i]
