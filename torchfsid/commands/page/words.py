@@ -64,11 +64,11 @@ def of_safety(owner: str, entry: Mapping[str, Any]) -> dict[str, Any]:
         entry: `safety` of regions.json.
     """
     lines, by_data = [], entry["bounded_by_data"]
-    for key, name, unit in (("gain", "gain", ""), ("safety_distance", "safety distance", " m"), ("margin", "margin", " m")):
+    for key, unit in (("gain", ""), ("safety_distance", " m"), ("margin", " m")):
         if key in entry:
             ends = zip(entry[key], by_data[key], strict=True)
             low, high = (f"{end:.4g}{'' if is_found else '*'}" for end, is_found in ends)
-            lines.append([name, f"{low} to {high}{unit}"])
+            lines.append([key.replace("_", " "), f"{low} to {high}{unit}"])
     return {
         "of": owner,
         "lines": lines,
@@ -105,11 +105,12 @@ def model(config: Mapping[str, Any]) -> list[list[str]]:
     lines = []
     task = config.get("task")
     if isinstance(task, Mapping):
-        numbers = [f"{key} {_short(value)}" for key, value in task.items() if key != "kind" and value is not None]
+        told = {key: value for key, value in task.items() if key != "kind" and value and value != "proportional"}
+        numbers = [f"{key.replace('_', ' ')} {_short(value)}" for key, value in told.items()]
         lines.append(["task", ", ".join([str(task.get("kind")), *numbers])])
     barriers = config.get("barriers")
     if isinstance(barriers, Sequence):
-        lines.append(["barriers", ", ".join(str(barrier.get("kind")) for barrier in barriers)])
+        lines.append(["barriers", ", ".join(str(barrier.get("kind")).replace("_", " ") for barrier in barriers)])
     if "set" in config:
         lines.append(["set", str(config["set"]).replace("_", " ")])
     return lines

@@ -263,7 +263,7 @@ function mapBounds(axes) {
   if (!data.is_place || !data.prior) return found;
   const whole = boundsOf(data.prior, axes);
   const wide = Math.max(...whole.map(([low, high]) => high - low));
-  return wide > 2 * span ? found : found.map(([low, high], k) => [Math.min(low, whole[k][0]), Math.max(high, whole[k][1])]);
+  return wide > 1.7 * span ? found : found.map(([low, high], k) => [Math.min(low, whole[k][0]), Math.max(high, whole[k][1])]);
 }
 
 /** The set of the chosen robot now, or the prior. */

@@ -18,7 +18,7 @@ function heading() {
       box.style.background = caseColour(letter);
       return element("span", {}, box, `${letter} ${words}`);
     }),
-    ...(robots.some((_, i) => doubted(i) !== null) ? [element("span", { className: "bad" }, "hatched: contradicted before")] : []));
+    ...(robots.some((_, i) => doubted(i) !== null) ? [element("span", { className: "bad" }, "hatched: after a contradiction")] : []));
   byId("size-head").textContent = MEASURES[state.measure];
   byId("point-head").textContent = data.is_place ? "centroid [m]" : `centroid (${data.parameters.join(", ")})`;
 }

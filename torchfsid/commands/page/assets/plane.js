@@ -20,7 +20,7 @@ function ticks(low, high, wanted) {
   const digits = Math.min(12, Math.max(0, -Math.floor(Math.log10(step) + 1e-9)));
   const values = [];
   for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 * step && values.length < 100; k++) values.push(k * step);
-  return values.map((value) => [value, (Math.abs(value) < step / 2 ? 0 : value).toFixed(digits)]);
+  return values.map((value) => [value, signed((Math.abs(value) < step / 2 ? 0 : value).toFixed(digits))]);
 }
 
 class Plane {
@@ -47,7 +47,7 @@ class Plane {
   /** Show the bounds with a margin, the scale equal on both axes unless their units differ. */
   fit() {
     const [x, y] = this.options.bounds(this.axes);
-    const [inner, tall] = [this.width - 62, this.height - 46];
+    const [inner, tall] = [this.width - this.left, this.height - this.foot];
     const spread = ([low, high]) => Math.max(high - low, 1e-12 * (1 + Math.abs(low)));
     const scales = [inner / (1.16 * spread(x)), tall / (1.16 * spread(y))];
     if (!this.options.stretched) scales.fill(Math.min(...scales));
@@ -61,7 +61,7 @@ class Plane {
   }
 
   get left() { return 46; }
-  get foot() { return 30; }
+  get foot() { return 20; }
 
   zoom(factor, x, y) {
     const c = this.camera, middle = [this.left + (this.width - this.left) / 2, (this.height - this.foot) / 2];
@@ -110,13 +110,8 @@ class Plane {
     }
     pen.strokeStyle = paper("line");
     pen.strokeRect(left + 0.5, 0.5, width - left - 1, bottom - 1);
-    pen.textBaseline = "alphabetic";
-    pen.fillText(this.names[0], width - 2, height - 2);
-    pen.save();
-    pen.translate(10, 4);
-    pen.rotate(-Math.PI / 2);
-    pen.fillText(this.names[1], 0, 0);
-    pen.restore();
+    label(pen, this.names[0], width - 7, bottom - 10, paper("muted"), { weight: 500, align: "right" });
+    label(pen, this.names[1], left + 7, 12, paper("muted"), { weight: 500 });
   }
 
   listen() {

@@ -1,13 +1,16 @@
 // Numbers and elements as text.
 
+/** With a minus sign instead of a hyphen. */
+const signed = (text) => text.replace(/^-/, "−");
+
 /** A number with a few significant digits; tiny and huge ones as powers of ten. */
 function plain(value, digits = 3) {
   if (value === null || value === undefined || Number.isNaN(value)) return "–";
   if (value === 0) return "0";
   const size = Math.abs(value);
-  if (size >= 1e-3 && size < 1e5) return String(Number(value.toPrecision(digits)));
+  if (size >= 1e-3 && size < 1e5) return signed(String(Number(value.toPrecision(digits))));
   const [mantissa, exponent] = value.toExponential(digits - 1).split("e");
-  return `${Number(mantissa)}·10${superscript(Number(exponent))}`;
+  return `${signed(String(Number(mantissa)))}·10${superscript(Number(exponent))}`;
 }
 
 function superscript(exponent) {
@@ -27,7 +30,7 @@ function quantity(value, unit, digits = 3) {
 function point(values, size, unit) {
   if (!values || values.includes(null)) return "–";
   const digits = size > 0 ? Math.min(9, Math.max(0, Math.ceil(1 - Math.log10(size)))) : 3;
-  return `(${values.map((v) => v.toFixed(digits)).join(", ")})${unit ? ` ${unit}` : ""}`;
+  return `(${values.map((v) => signed(v.toFixed(digits))).join(", ")})${unit ? ` ${unit}` : ""}`;
 }
 
 /** A time of the log. */
