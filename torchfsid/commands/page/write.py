@@ -1,4 +1,4 @@
-"""Write pages: a template, its style and its scripts in one HTML file, which loads nothing."""
+"""Pages as text: a template, its style and its scripts in one HTML file, which loads nothing."""
 
 from __future__ import annotations
 
@@ -10,58 +10,53 @@ from pathlib import Path
 from typing import Any
 
 from torchfsid.commands.page.content import content
-from torchfsid.commands.results_folder import write_whole
 
 PAGE = "report.html"
-"""Name of the page in its results folder."""
+"""Name of a page in its results folder."""
 
-SCRIPTS = ("text.js", "state.js", "plane.js", "marks.js", "map.js", "chart.js", "timeline.js", "panels.js", "main.js")
+RUN = ("text.js", "state.js", "plane.js", "marks.js", "map.js", "chart.js", "timeline.js", "panels.js", "main.js")
 """Scripts of the page of a run, in the order in which they need each other."""
 
+TABLES = ("text.js", "tables.js")
+"""Scripts of a page of tables."""
 
-def write_page(folder: Path, truth: Mapping[str, Sequence[float]] | None = None) -> Path:
-    """Write report.html of a results folder.
+
+def run_page(folder: Path, truth: Mapping[str, Sequence[float]] | None = None) -> str:
+    """The page of a results folder of `torchfsid observe`, or of an experiment with such files.
 
     Args:
-        folder: the results folder of `torchfsid observe` or of an experiment with a scene.
-        truth: the true parameter of each robot, where it is known.
+        folder: the results folder.
+        truth: the true parameter of each robot, where it is known and not in config.yaml.
 
     Raises:
         FigureError: a file that the page needs is missing or damaged.
-        OSError: the page cannot be written.
     """
     record = content(folder, truth)
-    return write_html(folder / PAGE, record["heading"] or record["title"], "run", SCRIPTS, record)
+    return _page(record["heading"] or record["title"], "run", RUN, record)
 
 
-def write_html(path: Path, title: str, kind: str, scripts: Sequence[str], record: Mapping[str, Any]) -> Path:
-    """Write a page whose scripts find `record` as JSON.
+def tables_page(record: Mapping[str, Any]) -> str:
+    """A page of tables that can be sorted and searched.
 
     Args:
-        path: the file.
-        title: the title of the page.
-        kind: the template and the style: KIND.html, KIND.css beside the common page.css.
-        scripts: names of the scripts.
-        record: what the page shows.
+        record: `title`, `lead` (a sentence) and `tables`, a list of mappings with `title`, `columns` (names) and `rows`
+            (numbers, texts or None). A text [words, address] is a link.
     """
+    return _page(record["title"], "tables", TABLES, record)
+
+
+def _page(title: str, kind: str, scripts: Sequence[str], record: Mapping[str, Any]) -> str:
     assets = files("torchfsid.commands.page") / "assets"
 
     def text(name: str) -> str:
         return (assets / name).read_text(encoding="utf-8")
 
-    data = json.dumps(record, allow_nan=False, separators=(",", ":"), ensure_ascii=False)
     parts = {
         "title": html.escape(title),
         "style": text("page.css") + text(f"{kind}.css"),
         # "<" as an escape: no text of the data can end the element.
-        "data": data.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029"),
+        "data": json.dumps(record, allow_nan=False, separators=(",", ":"), ensure_ascii=False).replace("<", "\\u003c"),
         "script": "\n".join(map(text, scripts)),
     }
-    page = text(f"{kind}.html")
-    pieces = page.split("{{")
-    filled = [pieces[0]]
-    for piece in pieces[1:]:
-        name, rest = piece.split("}}", 1)
-        filled += [parts[name], rest]
-    write_whole(path, "".join(filled))
-    return path
+    first, *pieces = text(f"{kind}.html").split("{{")
+    return first + "".join(parts[name] + rest for name, _, rest in (piece.partition("}}") for piece in pieces))
