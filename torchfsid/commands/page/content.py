@@ -44,12 +44,17 @@ DRAWN = (2, 3)
 """Numbers of parameters whose sets are drawn."""
 
 
-def content(folder: Path, truth: Mapping[str, Sequence[float]] | None = None) -> dict[str, Any]:
+Told = Mapping[str, Sequence[Sequence[str]]]
+"""Further lines on robots, each a name and a value."""
+
+
+def content(folder: Path, truth: Mapping[str, Sequence[float]] | None = None, told: Told | None = None) -> dict[str, Any]:
     """Everything that the page of a results folder shows.
 
     Args:
         folder: the results folder of `torchfsid observe` or of an experiment with a scene.
         truth: the true parameter of each robot, where it is known and not in config.yaml.
+        told: further lines on some robots.
 
     Raises:
         FigureError: estimates.csv or regions.json is missing, or a file is damaged.
@@ -57,9 +62,12 @@ def content(folder: Path, truth: Mapping[str, Sequence[float]] | None = None) ->
     notes: list[str] = []
     config, final = _config(folder, notes), _json(folder / "regions.json")
     try:
-        return _content(folder, config, final, truth or config.get("truth") or {}, notes)
+        found = _content(folder, config, final, truth or config.get("truth") or {}, notes)
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise FigureError(f"{folder}: its files are damaged: {type(error).__name__}: {one_line(error)}") from error
+    for robot in found["robots"]:
+        robot["told"] = (told or {}).get(robot["name"], [])
+    return found
 
 
 def _content(

@@ -9,7 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from torchfsid.commands.page.content import content
+from torchfsid.commands.page.content import Told, content
 
 PAGE = "report.html"
 """Name of a page in its results folder."""
@@ -21,17 +21,18 @@ TABLES = ("text.js", "tables.js")
 """Scripts of a page of tables."""
 
 
-def run_page(folder: Path, truth: Mapping[str, Sequence[float]] | None = None) -> str:
+def run_page(folder: Path, truth: Mapping[str, Sequence[float]] | None = None, told: Told | None = None) -> str:
     """The page of a results folder of `torchfsid observe`, or of an experiment with such files.
 
     Args:
         folder: the results folder.
         truth: the true parameter of each robot, where it is known and not in config.yaml.
+        told: further lines on some robots.
 
     Raises:
         FigureError: a file that the page needs is missing or damaged.
     """
-    record = content(folder, truth)
+    record = content(folder, truth, told)
     return _page(record["heading"] or record["title"], "run", RUN, record)
 
 

@@ -150,7 +150,7 @@ function paintSets(plane, pen, who, named) {
     const middle = [(Math.max(...xs) + Math.min(...xs)) / 2, (Math.max(...ys) + Math.min(...ys)) / 2];
     const what = trusted ? [] : [`not trusted: ${statusAt(i, t)}`];
     const size = robots[i].diameter[state.k];
-    const about = [`${robots[i].name}: set of diameter ${quantity(size, data.units[0])}`, ...what];
+    const about = [`${robots[i].name}: set of diameter ${quantity(size, sameUnit)}`, ...what];
     if (wide < 9) {
       pen.lineWidth = 1.5;
       disc(pen, middle, 9, null, trusted ? ink : paper("grey"));

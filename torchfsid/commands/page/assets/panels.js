@@ -11,7 +11,7 @@ function heading() {
     `${robots.length} ${robots.length === 1 ? "robot" : "robots"}, ${data.samples} samples from ${seconds(data.t[0])} to ${seconds(data.t.at(-1))}. ` +
     `Verdicts: ${counts.map(([count, words]) => `${count} ${words}`).join(", ")}.`;
   byId("facts").replaceChildren(...data.model.map(([name, value]) => element("div", {}, element("dt", {}, name), element("dd", {}, value))));
-  byId("map-note").textContent = data.is_place ? "dashed: the prior; hatched: a set that is not trusted" : "the parameters are no places: see the sets beside it";
+  byId("map-note").textContent = data.is_place ? "dashed: the prior; hatched: a set that is not trusted" : "the parameters are no places: see their sets below";
   byId("cases").replaceChildren(
     ...Object.entries(CASES).map(([letter, words]) => {
       const box = element("i");
@@ -20,6 +20,7 @@ function heading() {
     }),
     ...(robots.some((_, i) => doubted(i) !== null) ? [element("span", { className: "bad" }, "hatched: after a contradiction")] : []));
   byId("size-head").textContent = MEASURES[state.measure];
+  byId("size-unit").textContent = sizeUnit() && sizeUnit() !== "m" ? `[${sizeUnit()}]` : "";
   byId("point-head").textContent = data.is_place ? "centroid [m]" : `centroid (${data.parameters.join(", ")})`;
 }
 
@@ -73,13 +74,13 @@ function verdict() {
       element("li", { className: event.reset ? "mild" : "" }, "At ", moveTo(event.t), `: ${event.what}`,
         element("ol", {}, ...event.samples.map((sample) => element("li", {}, sample.row, ...(sample.t === null ? [" (declared)"] : [" at ", moveTo(sample.t)])))))));
   }
-  const t = now(), untrusted = statusAt(i, t) !== TRUSTED, unit = data.units[0], size = robot.diameter[state.k];
+  const t = now(), untrusted = statusAt(i, t) !== TRUSTED, size = robot.diameter[state.k];
   const set = setAt(i, t);
   byId("lens-note").textContent = !robot.sets.length ? "" : !set ? "not known at this time" : untrusted ? "not trusted" : `${set[3].length} facets; point at one`;
   const values = [
     ["time", seconds(t)],
-    ["diameter", quantity(size, unit)],
-    [MEASURES.volume, quantity(robot.volume[state.k], power(data.units, data.dim))],
+    ["diameter", quantity(size, sameUnit)],
+    [MEASURES.volume, quantity(robot.volume[state.k], volumeUnit)],
     ["centroid", point(robot.centroid?.[state.k], size, "")],
     ["filter (UKF)", robot.ukf && point(robot.ukf[state.k], size, "")],
     ["hybrid", robot.hybrid && point(robot.hybrid[state.k], size, "")],
@@ -88,6 +89,7 @@ function verdict() {
     ["active rows", activeAt(i, t).join(", ") || "none"],
     ["shrank last", robot.last_cut === null ? "never" : moveTo(robot.last_cut)],
     ["samples not used", robot.skipped ? String(robot.skipped) : null],
+    ...robot.told,
   ];
   byId("values").replaceChildren(...values.filter(([, value]) => value).flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, value)]));
 }
@@ -148,10 +150,7 @@ function speeds() {
       pen.strokeStyle = paper("muted");
       if (largest) line(pen, chart.left, y(chart, largest), chart.width, y(chart, largest));
       pen.restore();
-      pen.fillStyle = paper("muted");
-      pen.textAlign = "left";
-      pen.textBaseline = "top";
-      pen.fillText("V [m/s]", 2, 0);
+      label(pen, "V [m/s]", chart.left + 7, chart.top + 8, paper("muted"), { weight: 500 });
     },
     lines(x) {
       const r = chart.value(x), found = rows().reduce((best, row) => (Math.abs(row[0] - r) < Math.abs(best[0] - r) ? row : best));

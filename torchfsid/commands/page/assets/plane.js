@@ -96,14 +96,14 @@ class Plane {
     pen.fillStyle = paper("muted");
     pen.textBaseline = "top";
     pen.textAlign = "center";
-    for (const [value, text] of ticks(x - w, x + w, (width - left) / 80)) {
+    for (const [value, text] of ticks(x - w, x + w, (width - left) / 72)) {
       const at = left + (width - left) / 2 + (value - x) * sx;
       line(pen, at, 0, at, bottom);
       if (at > left + 8 && at < width - 14) pen.fillText(text, at, bottom + 4);
     }
     pen.textBaseline = "middle";
     pen.textAlign = "right";
-    for (const [value, text] of ticks(y - h, y + h, bottom / 60)) {
+    for (const [value, text] of ticks(y - h, y + h, bottom / 72)) {
       const at = bottom / 2 - (value - y) * sy;
       line(pen, left, at, width, at);
       if (at > 8 && at < bottom - 4) pen.fillText(text, left - 5, at);

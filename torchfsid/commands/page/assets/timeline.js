@@ -1,8 +1,9 @@
 // The course of the run: the size of every set, and the case of every robot, over time.
 
 const ends = [data.t[0], data.t.at(-1) > data.t[0] ? data.t.at(-1) : data.t[0] + 1];
-const sizeUnit = () => (state.measure === "diameter" ? data.units[0] : power(data.units, data.dim));
-const power = (units, p) => (new Set(units).size === 1 && units[0] ? units[0] + ["", "", "²", "³"][p] : "");
+const sameUnit = new Set(data.units).size === 1 ? data.units[0] : "";
+const volumeUnit = sameUnit && sameUnit + ["", "", "²", "³"][data.dim];
+const sizeUnit = () => (state.measure === "diameter" ? sameUnit : volumeUnit);
 const MEASURES = { diameter: "diameter", volume: ["", "length", "area", "volume"][data.dim] ?? "volume" };
 
 /** Room for the names of the robots, the same in both charts so that their times are one below the other. */
@@ -10,7 +11,7 @@ const gutter = (() => {
   const pen = document.createElement("canvas").getContext("2d");
   pen.font = `11px ${FONT}`;
   const widest = Math.max(...robots.map((robot) => pen.measureText(short(robot.name)).width));
-  return () => Math.max(56, Math.min(110, widest + 12));
+  return () => Math.max(64, Math.min(110, widest + 12));
 })();
 
 function cursor(chart, pen) {
@@ -40,7 +41,7 @@ function sizeY(chart, value) {
 function paintSizes(chart, pen) {
   chart.bounds = sizeRange();
   chart.xAxis(pen, "t [s]");
-  for (const value of logTicks(...chart.bounds)) chart.yTick(pen, sizeY(chart, value), quantity(value, sizeUnit()));
+  for (const value of logTicks(...chart.bounds)) chart.yTick(pen, sizeY(chart, value), quantity(value, sizeUnit() === "m" ? "m" : ""));
   pen.lineJoin = "round";
   for (const i of shownRobots()) {
     const since = doubted(i), values = robots[i][state.measure];
