@@ -44,15 +44,16 @@ def sweep_page(folder: Path, config: SweepConfig) -> str:
     names = list(dict.fromkeys(name for point in points for name in point if name != "point"))
     rows = [[*point["point"], *(point.get(name) for name in names)] for point in points]
     failed = f", {summary['failed']} failed (see the column error)" if summary["failed"] else ""
-    columns = [name.replace("_", " ") for name in runs]
-    lines = [[_plain(value) for value in line] for line in zip(*runs.values(), strict=True)]
+    lead = f"A sweep: {summary['runs']} of {config.runs} runs{failed}."
+    cells = {name.replace("_", " "): [_plain(value) for value in values] for name, values in runs.items()}
+    told = {name: values for name, values in cells.items() if any(value is not None for value in values)}
     return tables_page(
         {
             "title": summary["title"],
-            "lead": f"A sweep: {summary['runs']} of {config.runs} runs{failed}. Sizes and errors are in metres, at the last of its times.",
+            "lead": f"{lead} Sizes and errors are in metres, at the last of its times.",
             "tables": [
                 {"title": "Points of the grid", "columns": [*summary["keys"], *names], "rows": rows},
-                {"title": "Runs", "columns": columns, "rows": lines},
+                {"title": "Runs", "columns": list(told), "rows": list(zip(*told.values(), strict=True))},
             ],
         }
     )

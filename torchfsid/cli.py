@@ -40,7 +40,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     if chosen.command == "observe":
         folder = ResultsFolder(chosen.out, OBSERVE)
-        return execute("torchfsid", lambda: _observe(chosen.log, chosen.config, folder, chosen.set, chosen.report), folder)
+        return execute(
+            "torchfsid", lambda: _observe(chosen.log, chosen.config, folder, chosen.set, chosen.report), folder
+        )
     if chosen.command == "report":
         results = ResultsFolder(chosen.out, None)
         return execute("torchfsid", lambda: _report(results), results)

@@ -48,7 +48,9 @@ Told = Mapping[str, Sequence[Sequence[str]]]
 """Further lines on robots, each a name and a value."""
 
 
-def content(folder: Path, truth: Mapping[str, Sequence[float]] | None = None, told: Told | None = None) -> dict[str, Any]:
+def content(
+    folder: Path, truth: Mapping[str, Sequence[float]] | None = None, told: Told | None = None
+) -> dict[str, Any]:
     """Everything that the page of a results folder shows.
 
     Args:
@@ -153,12 +155,13 @@ class Estimates:
     """
 
     def __init__(self, table: Table):
-        self._table = table
+        self._table, self._read = table, dict[str, np.ndarray]()
         self.robots = list(dict.fromkeys(table.texts("robot")))
         if not self.robots or table.rows % len(self.robots):
             raise FigureError(f"{table.path}: is damaged: the robots have not the same times, or none")
         self.t = self._by_robot("t")[:, 0]
         self.dim = len(table.indexed("centroid"))
+        self._case = np.array(table.texts("case")).reshape(-1, len(self.robots))
         self._status = np.array(table.texts("status")).reshape(-1, len(self.robots))
 
     def kept(self, notes: list[str]) -> np.ndarray:
@@ -184,7 +187,7 @@ class Estimates:
         found: dict[str, Any] = {
             "diameter": significant(diameter),
             "volume": significant(self._by_robot("volume")[kept, i]),
-            "case": "".join(case or " " for case in np.array(self._table.texts("case")).reshape(self._status.shape)[kept, i]),
+            "case": "".join(case or " " for case in self._case[kept, i]),
             "statuses": self._statuses(i, shift),
         }
         finest = float(np.nanmin(diameter, initial=math.inf, where=diameter > 0))
@@ -202,21 +205,20 @@ class Estimates:
         return [[shift(float(self.t[k])), str(status[k])] for k in starts]
 
     def _by_robot(self, column: str) -> np.ndarray:
-        return self._table.numbers(column).reshape(-1, len(self.robots))
+        if column not in self._read:
+            self._read[column] = self._table.numbers(column).reshape(-1, len(self.robots))
+        return self._read[column]
 
 
-def _sets(
-    folder: Path, final: Mapping[str, Any], history: Estimates, notes: list[str]
-) -> dict[str, list[Facets]]:
+def _sets(folder: Path, final: Mapping[str, Any], history: Estimates, notes: list[str]) -> dict[str, list[Facets]]:
     """The sets to be drawn. Without sets.csv these are the final ones."""
     if history.dim not in DRAWN:
         notes.append(f"Sets of {history.dim} parameters are not drawn; their sizes are.")
         return {}
     if (folder / "sets.csv").is_file():
-        sets, left_out = fewer(read_sets(folder / "sets.csv"))
         notes.append("Between two entries of sets.csv the older set is drawn: it contains the newer one.")
-        return sets if left_out is None else _noted(sets, left_out, notes)
-    notes.append("sets.csv is missing: only the final sets are drawn, at the end. Run observe again to have it.")
+        return fewer(read_sets(folder / "sets.csv"), notes)
+    notes.append("sets.csv is missing: only the final sets are drawn, at the end (torchfsid observe writes it).")
     end = float(history.t[-1])
     return {
         robot: [
@@ -230,11 +232,6 @@ def _sets(
         ]
         for robot, region in final["robots"].items()
     }
-
-
-def _noted(sets: dict[str, list[Facets]], note: str, notes: list[str]) -> dict[str, list[Facets]]:
-    notes.append(note)
-    return sets
 
 
 def _keep_out(config: Mapping[str, Any]) -> float | None:

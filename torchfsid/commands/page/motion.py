@@ -32,7 +32,7 @@ def read_motion(folder: Path, names: dict[str, int], shift: Shift, notes: list[s
     """
     path = next((folder / name for name in ("motion.csv", "trajectory.csv") if (folder / name).is_file()), None)
     if path is None:
-        notes.append("motion.csv is missing: no motion is drawn. Run observe again to have it.")
+        notes.append("motion.csv is missing: no motion is drawn (torchfsid observe writes it).")
         return None
     table = Table(path)
     axes = [axis for axis in "xyz" if axis in table.columns]

@@ -66,7 +66,7 @@ def hypotheses_pages(out: Path) -> dict[str, str]:
     columns = ["robot", "model", "verdict", "refuted at [s]", "by", "volume at the end"]
     record = {
         "title": f"{out.resolve().name}: which model is it?",
-        "lead": f"{len(robots)} robots under {len(models)} models. A log can only refute: a possible model may be wrong.",
+        "lead": f"{len(robots)} robots under {len(models)} models. A log can only refute: what is possible may be wrong.",
         "tables": [{"title": "Every robot under every model", "columns": columns, "rows": rows}],
     }
     return {f"{model}/{PAGE}": run_page(out / model) for model in models} | {PAGE: tables_page(record)}

@@ -68,18 +68,19 @@ def read_sets(path: Path) -> dict[str, list[Facets]]:
     return sets
 
 
-def fewer(sets: dict[str, list[Facets]]) -> tuple[dict[str, list[Facets]], str | None]:
-    """At most `MOST_FACETS` facets, and what was left out in words, None if nothing was."""
+def fewer(sets: dict[str, list[Facets]], notes: list[str]) -> dict[str, list[Facets]]:
+    """At most about `MOST_FACETS` facets. What was left out becomes a sentence of `notes`."""
     facets = sum(len(one.b) for of_robot in sets.values() for one in of_robot)
     if facets <= MOST_FACETS:
-        return sets, None
+        return sets
     share, before = MOST_FACETS / facets, sum(map(len, sets.values()))
     kept = {
         robot: [of_robot[k] for k in thinned(len(of_robot), int(share * len(of_robot)))]
         for robot, of_robot in sets.items()
     }
-    after = sum(map(len, kept.values()))
-    return kept, f"{after} of the {before} sets in sets.csv are shown, evenly chosen for each robot."
+    shown = sum(map(len, kept.values()))
+    notes.append(f"{shown} of the {before} sets in sets.csv are shown, evenly chosen for each robot.")
+    return kept
 
 
 def drawn(sets: Sequence[Facets], around: tuple[np.ndarray, np.ndarray], names: dict[str, int]) -> list[list[Any]]:

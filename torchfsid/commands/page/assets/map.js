@@ -137,7 +137,7 @@ function paintSets(plane, pen, who, named) {
     const wide = Math.max(Math.max(...xs) - Math.min(...xs), Math.max(...ys) - Math.min(...ys));
     trace(pen, outline);
     pen.fillStyle = trusted ? ink : paper("grey");
-    pen.globalAlpha = trusted ? 0.2 : 0.14;
+    pen.globalAlpha = trusted ? (who.length > 6 ? 0.12 : 0.2) : 0.14;
     pen.fill();
     pen.globalAlpha = 1;
     if (!trusted) hatch(pen, outline, paper("grey"));
