@@ -111,7 +111,8 @@ def _content(
                 "evidence": words.evidence(region, shift),
                 "skipped": region.get("skipped"),
                 "last_cut": shift(region.get("last_cut")),
-                "truth": list(truth[robot]) if robot in truth else None,
+                "truth": list(truth[robot]) if robot in truth else region.get("truth", {}).get("theta"),
+                "inside": region.get("truth", {}).get("inside"),
                 "sets": drawn(sets.get(robot, []), around, names),
                 **history.of_robot(i, kept, shift),
             }
@@ -167,7 +168,7 @@ class Estimates:
     def kept(self, notes: list[str]) -> np.ndarray:
         """Indices of the times on the page: evenly, and whenever the status of a robot changes."""
         changes = np.flatnonzero((self._status[1:] != self._status[:-1]).any(-1)) + 1
-        kept = thinned(len(self.t), min(MOST_TIMES, MOST_LINES // len(self.robots)), changes)
+        kept = thinned(len(self.t), min(MOST_TIMES, MOST_LINES // len(self.robots)), changes.tolist())
         if len(kept) < len(self.t):
             notes.append(f"{len(kept)} of the {len(self.t)} times in estimates.csv are shown, evenly chosen.")
         return kept

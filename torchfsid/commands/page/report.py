@@ -64,9 +64,10 @@ def hypotheses_pages(out: Path) -> dict[str, str]:
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise FigureError(f"{out / HYPOTHESES}: missing or damaged: {one_line(error)}") from error
     columns = ["robot", "model", "verdict", "refuted at [s]", "by", "volume at the end"]
+    counts = f"{len(robots)} robots under {len(models)} models."
     record = {
         "title": f"{out.resolve().name}: which model is it?",
-        "lead": f"{len(robots)} robots under {len(models)} models. A log can only refute: what is possible may be wrong.",
+        "lead": f"{counts} A log can only refute: what is possible may still be wrong.",
         "tables": [{"title": "Every robot under every model", "columns": columns, "rows": rows}],
     }
     return {f"{model}/{PAGE}": run_page(out / model) for model in models} | {PAGE: tables_page(record)}

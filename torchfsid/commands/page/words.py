@@ -41,7 +41,7 @@ def evidence(region: Mapping[str, Any], shift: Shift) -> list[dict[str, Any]]:
         found.append({"t": shift(event["t"]), "what": what, "samples": samples, "reset": event["reset"]})
     aside = region.get("outliers", {}).get("set_aside", [])
     for sample in aside:
-        names = sample.get("rows") or [row_name({"source": source}) for source in sample["sources"]]
+        names = sample.get("constraints") or [row_name({"source": source}) for source in sample["sources"]]
         what = "set aside as an outlier:" if sample["certain"] else "may be the outlier that is set aside:"
         t = shift(sample["t"])
         samples = [{"t": t, "row": name} for name in dict.fromkeys(names)]
@@ -51,8 +51,8 @@ def evidence(region: Mapping[str, Any], shift: Shift) -> list[dict[str, Any]]:
 
 def row_name(row: Mapping[str, Any]) -> str:
     """The name of the constraint behind an entry of regions.json, or its number where the file has no names."""
-    if isinstance(row.get("row"), str):
-        return row["row"]
+    if "constraint" in row:
+        return row["constraint"]
     return "prior" if row["source"] < 0 else f"row {row['source']}"
 
 

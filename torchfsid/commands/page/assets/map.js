@@ -257,13 +257,11 @@ function boundsOf(points, [a, b]) {
 /** What the map shows at first: all motion, final sets and truths, and the prior if it is not much larger. */
 function mapBounds(axes) {
   const sets = data.is_place ? robots.flatMap((robot) => [...(robot.sets.at(-1)?.[1] ?? []), robot.truth]) : [];
-  const found = boundsOf([...bodies.flatMap((body) => body.x), ...sets], axes);
-  const span = Math.max(...found.map(([low, high]) => high - low));
-  if (!Number.isFinite(span)) return data.is_place && data.prior ? boundsOf(data.prior, axes) : [[-1, 1], [-1, 1]];
-  if (!data.is_place || !data.prior) return found;
-  const whole = boundsOf(data.prior, axes);
-  const wide = Math.max(...whole.map(([low, high]) => high - low));
-  return wide > 1.7 * span ? found : found.map(([low, high], k) => [Math.min(low, whole[k][0]), Math.max(high, whole[k][1])]);
+  const points = [...bodies.flatMap((body) => body.x), ...sets].filter(Boolean);
+  const prior = data.is_place && data.prior ? data.prior : [];
+  if (!points.length) return boundsOf(prior.length ? prior : [data.parameters.map(() => -1), data.parameters.map(() => 1)], axes);
+  const width = (list) => Math.max(...list[0].map((_, axis) => boundsOf(list, [axis, axis])[0]).map(([low, high]) => high - low));
+  return boundsOf(prior.length && width(prior) < 1.7 * width(points) ? [...points, ...prior] : points, axes);
 }
 
 /** The set of the chosen robot now, or the prior. */

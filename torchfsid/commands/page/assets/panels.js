@@ -69,7 +69,7 @@ function verdict() {
     said = i;
     byId("lens-title").textContent = `${robot.name}: its set, enlarged`;
     byId("verdict-title").replaceChildren(swatch(i), `${robot.name}: `, element("span", { className: robot.status === TRUSTED ? "good" : "bad" }, WORDS[robot.status]));
-    byId("verdict").textContent = robot.meaning;
+    byId("verdict").textContent = robot.meaning + (robot.status === TRUSTED ? "" : " torchfsid check says which rows and bounds do not fit.");
     byId("evidence").replaceChildren(...robot.evidence.map((event) =>
       element("li", { className: event.reset ? "mild" : "" }, "At ", moveTo(event.t), `: ${event.what}`,
         element("ol", {}, ...event.samples.map((sample) => element("li", {}, sample.row, ...(sample.t === null ? [" (declared)"] : [" at ", moveTo(sample.t)])))))));
@@ -85,6 +85,7 @@ function verdict() {
     ["filter (UKF)", robot.ukf && point(robot.ukf[state.k], size, "")],
     ["hybrid", robot.hybrid && point(robot.hybrid[state.k], size, "")],
     [`true ${data.place}`, robot.truth && point(robot.truth, size / 10, "")],
+    ["truth at the end", robot.inside === null ? null : robot.inside ? "inside the set" : "outside the set"],
     ["case", robot.case[state.k] === " " ? "not measured" : `${robot.case[state.k]}: ${CASES[robot.case[state.k]]}`],
     ["active rows", activeAt(i, t).join(", ") || "none"],
     ["shrank last", robot.last_cut === null ? "never" : moveTo(robot.last_cut)],
