@@ -5,14 +5,14 @@ import json
 import math
 import re
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import jaxtyping
 import pytest
 import torch
-from matplotlib.figure import Figure
 from playwright.sync_api import Browser, Page
 
 from tests.browser import browser
@@ -21,7 +21,7 @@ from torchfsid.cli import main
 from torchfsid.commands.page import content as contents
 from torchfsid.commands.page import sets
 from torchfsid.commands.page.content import content
-from torchfsid.commands.page.write import run_page
+from torchfsid.commands.page.write import run_page, tables_page
 from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.simulation import simulate
@@ -40,9 +40,8 @@ CONFIG = {
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The results of ten robots on a circle, one of which moves for a second as its task does not say."""
-    jaxtyping.config.update("jaxtyping_disable", True)  # a user's run, in a user's time
     random = torch.Generator().manual_seed(4)
     angles = torch.arange(ROBOTS, dtype=torch.float64) * (2 * math.pi / ROBOTS)
     start = 4 * torch.stack([angles.cos(), angles.sin()], dim=-1)
@@ -56,11 +55,20 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     out = tmp_path_factory.mktemp("page")
     log = write_log(out / "log.csv", run, [*NAMES, "pillar"], errors)
     config = write_config(out / "config.yaml", CONFIG)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Figure, "savefig", lambda figure, file, **options: file.write(b"."))
-        assert main(["observe", str(log), "--config", str(config), "--out", str(out / "run"), "--report"]) == 0
-    jaxtyping.config.update("jaxtyping_disable", False)
-    yield out / "run"
+    command = [
+        sys.executable,
+        "-m",
+        "torchfsid.cli",
+        "observe",
+        log,
+        "--config",
+        config,
+        "--out",
+        out / "run",
+        "--report",
+    ]
+    subprocess.run(command, check=True, capture_output=True)  # apart from us: the checks of shapes would take minutes
+    return out / "run"
 
 
 @pytest.fixture(scope="module")
@@ -287,3 +295,25 @@ def test_sets_in_space_have_three_views(tmp_path: Path, chromium: Browser) -> No
             edges = page.evaluate(f"torchfsid.lens[{view}].hits.filter(hit => hit.facet)")
             assert len(edges) == 4
             assert all(len(edge["lines"]) == 4 for edge in edges)
+
+
+def test_tables_are_sorted_and_searched(tmp_path: Path, chromium: Browser) -> None:
+    rows = [["b", 2.5, ["there", "b/report.html"]], ["a", None, ["here", "a/report.html"]], ["c", 10, "<i>no page"]]
+    table = {"title": "Runs", "columns": ["name", "number", "page"], "rows": rows}
+    (tmp_path / "report.html").write_text(tables_page({"title": "A sweep", "lead": "Three runs.", "tables": [table]}))
+    with opened(chromium, tmp_path / "report.html", 400) as page:
+
+        def column(k: int) -> list[str]:
+            return page.locator(f"tbody td:nth-child({k})").all_inner_texts()
+
+        assert column(1) == ["b", "a", "c"]
+        page.get_by_role("button", name="number").click()
+        assert column(2) == ["2.5", "10", ""]  # numbers as numbers, nothing last
+        page.get_by_role("button", name="number").click()
+        assert column(2) == ["10", "2.5", ""]
+        page.get_by_role("searchbox").fill("here")
+        assert column(3) == ["there", "here"]
+        assert page.get_by_role("link", name="there", exact=True).get_attribute("href") == "b/report.html"
+        page.get_by_role("searchbox").fill("no page")
+        assert column(3) == ["<i>no page"]
+        assert page.evaluate("document.documentElement.scrollWidth") == 400
