@@ -217,7 +217,12 @@ def _sets(folder: Path, final: Mapping[str, Any], history: Estimates, notes: lis
         notes.append(f"Sets of {history.dim} parameters are not drawn; their sizes are.")
         return {}
     if (folder / "sets.csv").is_file():
-        notes.append("Between two entries of sets.csv the older set is drawn: it contains the newer one.")
+        from torchfsid.commands.history import STEP
+
+        notes.append(
+            f"sets.csv has a set again when it has changed by {STEP:.0%}. In between the older one is drawn, which contains "
+            "the newer."
+        )
         return fewer(read_sets(folder / "sets.csv"), notes)
     notes.append("sets.csv is missing: only the final sets are drawn, at the end (torchfsid observe writes it).")
     end = float(history.t[-1])
