@@ -220,8 +220,8 @@ def _sets(folder: Path, final: Mapping[str, Any], history: Estimates, notes: lis
         from torchfsid.commands.history import STEP
 
         notes.append(
-            f"sets.csv has a set again when it has changed by {STEP:.0%}. In between the older one is drawn, which contains "
-            "the newer."
+            f"sets.csv has a set again when it has changed by {STEP:.0%}. "
+            "In between the older one is drawn, which contains the newer."
         )
         return fewer(read_sets(folder / "sets.csv"), notes)
     notes.append("sets.csv is missing: only the final sets are drawn, at the end (torchfsid observe writes it).")
