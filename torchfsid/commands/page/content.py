@@ -24,7 +24,7 @@ from torchfsid.errors import ConfigError, FigureError, one_line
 MOST_TIMES = 2000
 """Times of estimates.csv on the page."""
 
-MOST_LINES = 60_000
+MOST_LINES = 30_000
 """Lines of estimates.csv on the page: a time has one for each robot."""
 
 EPOCH = 1e8

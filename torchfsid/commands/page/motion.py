@@ -14,6 +14,9 @@ from torchfsid.commands.page.words import Shift
 MOST_TIMES = 2000
 """Times of motion.csv, and of a trajectory on the page."""
 
+MOST_LINES = 30_000
+"""Lines of motion.csv on the page: a time has one for each body."""
+
 FINE = 1e-5
 """Resolution of positions and velocities, in units of their range."""
 
@@ -37,7 +40,7 @@ def read_motion(folder: Path, names: dict[str, int], shift: Shift, notes: list[s
     table = Table(path)
     axes = [axis for axis in "xyz" if axis in table.columns]
     every, sample = np.unique(table.numbers("t")[:, 0], return_inverse=True)
-    kept = thinned(len(every), MOST_TIMES)
+    kept = thinned(len(every), min(MOST_TIMES, MOST_LINES // len(set(table.texts("robot")))))
     if len(kept) < len(every):
         notes.append(f"{len(kept)} of the {len(every)} times in {path.name} are shown, evenly chosen.")
     elif path.name == "motion.csv" and len(every) > MOST_TIMES // 2:
