@@ -14,6 +14,8 @@ from torchfsid.commands.declared_log import AUTO_FACTOR, DeclaredLog
 from torchfsid.commands.figures import draw_observation
 from torchfsid.commands.hypotheses import Hypotheses
 from torchfsid.commands.observe import Observation
+from torchfsid.commands.page.report import write_pages
+from torchfsid.commands.page.write import PAGE
 from torchfsid.commands.results_folder import ResultsFolder, write_json, write_whole
 from torchfsid.commands.safety_figure import draw_safety
 from torchfsid.commands.terminal import console, status, track
@@ -33,19 +35,23 @@ UNKNOWN_FILES = ("safety.png", "safety.pdf", "unknown_numbers.json", "task_gain.
 CHECKED = "check.json"
 
 
-def observe_log(path: Path, models: Mapping[str, ObserveConfig], folder: ResultsFolder) -> None:
+def observe_log(
+    path: Path, models: Mapping[str, ObserveConfig], folder: ResultsFolder, with_page: bool = False
+) -> None:
     """`torchfsid observe`: infer the sets of a log's robots, under one model or under several hypotheses.
 
-    A file that cannot be written or drawn is reported at the end, after everything else is done.
+    A file that cannot be written or drawn is reported at the end, after everything else is done. `with_page` writes
+    report.html, too.
     """
     use_one_thread()
     log = _read(path, models)
     run = _ready({name: DeclaredLog(model, log) for name, model in models.items()})
     of_each = run.observations if isinstance(run, Hypotheses) else {"": run}
-    files = [f"{name}/{file}" if name else file for name in of_each for file in ("config.yaml", *FILES, *UNKNOWN_FILES)]
+    of_model = ("config.yaml", *FILES, *UNKNOWN_FILES, *([PAGE] if with_page else []))
+    files = [f"{name}/{file}" if name else file for name in of_each for file in of_model]
     first = next(iter(models.values()))
     bound_file = f"{first.noise.quantity}_bound.json"
-    also = [bound_file, *(["hypotheses.json"] if isinstance(run, Hypotheses) else [])]
+    also = [bound_file, *(["hypotheses.json", *([PAGE] if with_page else [])] if isinstance(run, Hypotheses) else [])]
     folder.claim([*files, *also], dump_models({name: of.stated for name, of in of_each.items()}))
     if run.smallest_bounds is not None:
         found = {"smallest": run.smallest_bounds, "factor": AUTO_FACTOR, "used": run.bound_used}
@@ -70,12 +76,15 @@ def observe_log(path: Path, models: Mapping[str, ObserveConfig], folder: Results
                     draw_safety(out)
         except (OSError, FigureError) as problem:
             problems.append(problem)
+    try:
+        if isinstance(run, Hypotheses):
+            run.write_verdicts(folder.path)
+        if with_page:
+            write_pages(folder.path)
+    except (OSError, FigureError) as problem:
+        problems.append(problem)
     report.print_reading(log.reading, console())
     if isinstance(run, Hypotheses):
-        try:
-            run.write_verdicts(folder.path)
-        except OSError as problem:
-            problems.append(problem)
         report.print_hypotheses(run, folder.path, console())
     else:
         report.print_verdicts(run, folder.path, console())
