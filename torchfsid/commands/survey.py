@@ -4,12 +4,17 @@ From these a configuration is filled in (`init`). Guesses are named as such. The
 the second half of the log, where robots are often free of each other, by least squares
 
     u = gain (theta - x) - damping v            theta: a constant for each robot; no damping at first order
+
+The gain of an avoidance barrier, h = |dx|^2 - Ds^2, is the smallest that forbids nothing that was seen:
+
+    h' + gain h >= 0        or      h'' + 2 gain h' + gain^2 h >= 0
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -59,6 +64,7 @@ class Survey:
         moving: which bodies move. All, if none does.
         step: median time between samples [s].
         closest: the smallest distance between two bodies [m], infinite for one body.
+        clearance: the smallest distance between the discs of two bodies [m], if the log has radii.
         controls: the controls: accelerations, velocities, or differences of positions.
         known: where they are known.
         fastest: the largest control of a moving body [m/s or m/s2].
@@ -74,6 +80,7 @@ class Survey:
     moving: Bool[np.ndarray, "bodies"]
     step: float
     closest: float
+    clearance: float
     controls: Float[np.ndarray, "times bodies n"]
     known: Bool[np.ndarray, "times bodies"]
     fastest: float
@@ -95,6 +102,16 @@ class Survey:
         """The box in which the moving bodies were [m]."""
         x = self.log.x[:, self.moving][self.log.seen[:, self.moving]]
         return x.min(axis=0), x.max(axis=0)
+
+    def least_gain(self, safety_distance: float) -> float | None:
+        """The smallest gain of an avoidance barrier that forbids nothing seen [1/s]. None if there is none.
+
+        Args:
+            safety_distance: Ds [m].
+        """
+        if self.is_restless or (self.log.a is not None and self.log.u is None):
+            return None
+        return _least_gain(self, safety_distance)
 
 
 def survey(log: Log) -> Survey:
@@ -123,7 +140,8 @@ def survey(log: Log) -> Survey:
         log=log,
         moving=moving,
         step=float(np.median(np.diff(log.t))),
-        closest=_closest(log),
+        closest=_closest(log, np.zeros(len(log.bodies))),
+        clearance=_closest(log, np.zeros(len(log.bodies)) if log.radius is None else log.radius),
         controls=controls,
         known=known,
         fastest=fastest,
@@ -148,11 +166,11 @@ def _moving(log: Log, controls: np.ndarray, known: np.ndarray) -> np.ndarray:
     return moving if moving.any() and ways.max() > 0 else np.ones(len(log.bodies), dtype=bool)
 
 
-def _closest(log: Log) -> float:
-    """The smallest distance between two bodies that are there at the same time."""
+def _closest(log: Log, radius: np.ndarray) -> float:
+    """The smallest distance between the discs of two bodies that are there at the same time."""
     closest = math.inf
     for i in range(len(log.bodies) - 1):
-        apart = np.linalg.norm(log.x[:, i + 1 :] - log.x[:, i : i + 1], axis=-1)
+        apart = np.linalg.norm(log.x[:, i + 1 :] - log.x[:, i : i + 1], axis=-1) - radius[i + 1 :] - radius[i]
         closest = min(closest, float(apart[log.seen[:, i + 1 :] & log.seen[:, i : i + 1]].min(initial=math.inf)))
     return closest
 
@@ -231,3 +249,23 @@ def _fitted(columns: np.ndarray, u: np.ndarray, owner: np.ndarray) -> list[float
         kept = off <= 2 * float(np.median(off[kept])) + 1e-9 * size
     fits = size > 0 and off[kept].max() < FITS * size and kept.sum() > FITTING * len(u)
     return gains.tolist() if fits and (gains > 0).all() else None
+
+
+def _least_gain(seen: Survey, safety_distance: float) -> float | None:
+    log, least = seen.log, 0.0
+    speeds = seen.controls if log.a is None or log.u is None else log.u
+    for i, j in combinations(range(len(log.bodies)), 2):
+        there = seen.known[:, i] & seen.known[:, j] & log.seen[:, i] & log.seen[:, j]
+        dx, dv, da = ((of[:, i] - of[:, j])[there] for of in (log.x, speeds, seen.controls))
+        h, rate = (dx**2).sum(axis=-1) - safety_distance**2, 2 * (dx * dv).sum(axis=-1)
+        if (h <= 0).any():
+            return None
+        if log.a is None:
+            least = max(least, float((-rate / h).max(initial=0.0)))
+            continue
+        # gain^2 h + 2 gain h' + h'': beyond its larger root it is not negative
+        bend = 2 * (dv**2).sum(axis=-1) + 2 * (dx * da).sum(axis=-1)
+        root = np.sqrt(np.maximum(rate**2 - h * bend, 0.0))
+        dips = rate**2 > h * bend
+        least = max(least, float(((root - rate) / h)[dips].max(initial=0.0)))
+    return least if least > 0 else None
