@@ -118,7 +118,7 @@ def _motion(found: Recognised, seen: Survey) -> list[str]:
         heading = found.heading or "heading"
         return [
             line("velocity: differentiated", "commands are recovered from poses"),
-            line("body:", "they drive along their headings: unicycles"),
+            line("body:", "EDIT: they drive along their headings; leave this out if they need not"),
             "  kind: unicycle",
             *([line(f"  heading: {word(heading)}", "the column [rad]")] if found.heading else []),
             line("  map: si_to_uni", "EDIT: from commands to wheels; or look_ahead with distance: 0.05"),

@@ -43,6 +43,9 @@ ROUNDS = 8
 FEW = 10
 """Samples below which nothing is guessed."""
 
+TURNED = 0.1
+"""Headings that differ by less are none: whatever wrote the log has left orientations out [rad]."""
+
 DRIFT = 0.25
 """Sine of the angle between velocity and heading below which a body drives along its heading, and is a unicycle."""
 
@@ -188,7 +191,7 @@ def _is_unicycle(log: Log, controls: np.ndarray, known: np.ndarray, moving: np.n
         return False
     speeds = np.linalg.norm(controls, axis=-1)
     chosen = known & log.oriented & moving & (speeds > 0.2 * speeds[known].max(initial=0.0))
-    if chosen.sum() < FEW:
+    if chosen.sum() < FEW or float(np.ptp(np.unwrap(np.sort(log.heading[chosen])))) < TURNED:
         return False
     ahead = np.stack([np.cos(log.heading), np.sin(log.heading)], axis=-1)[chosen]
     u = controls[chosen]

@@ -46,7 +46,7 @@ def bag_section(path: Path) -> dict[str, Any]:
 
             tree = _Tree(Transforms(str(path), "", namespaces(types, TRANSFORMS)))
             spoken = [c for c in reader.connections if c.topic in tf_topics(types, TRANSFORMS)]
-            for connection, _, raw in reader.messages(spoken):
+            for connection, _, raw in reader.messages(spoken) if spoken else ():  # no connections would mean all
                 tree.add(connection.topic, decode(raw, connection.msgtype))
             positions = [topic for topic, of in types.items() if of in ({ODOMETRY}, {POSE})]
             bodies, frames = _topics(types, _labels(positions)), {}
