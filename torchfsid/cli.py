@@ -89,6 +89,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     start.add_argument("--out", type=Path, default=Path("config.yaml"), help="default: config.yaml; never replaced")
     observe.add_argument("--out", type=Path, required=True, help="results folder")
     observe.add_argument("--report", action="store_true", help="write report.html, too: a page of the run")
+    observe.add_argument(
+        "--mcap",
+        type=Path,
+        metavar="FILE.mcap",
+        help="the run as ROS 2 messages, for Foxglove, RViz, rerun (docs/mcap.md)",
+    )
+    observe.add_argument("--merge", action="store_true", help="copy the messages of LOG, a bag, into FILE.mcap")
     check.add_argument("--out", type=Path, help="folder for check.json")
     report = commands.add_parser("report", help="write report.html of a results folder: a page that opens offline")
     report.add_argument("out", type=Path, metavar="DIR", help="results folder of observe")
@@ -101,9 +108,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return execute("torchfsid", _schema)
     if chosen.command == "observe":
         folder = ResultsFolder(chosen.out, OBSERVE)
-        return execute(
-            "torchfsid", lambda: _observe(chosen.log, chosen.config, folder, chosen.set, chosen.report), folder
-        )
+        if chosen.merge and chosen.mcap is None:
+            parser.error("--merge: expected --mcap beside it")
+        return execute("torchfsid", lambda: _observe(chosen, folder), folder)
     if chosen.command == "report":
         results = ResultsFolder(chosen.out, None)
         return execute("torchfsid", lambda: _report(results), results)
@@ -125,17 +132,17 @@ def _schema() -> None:
     print_schema()
 
 
-def _observe(log: Path, config: Path, folder: ResultsFolder, overrides: Sequence[str], report: bool) -> None:
+def _observe(chosen: argparse.Namespace, folder: ResultsFolder) -> None:
     with importing():
         from torchfsid.config.models import load_models
 
     folder.require_ours()
-    models = load_models(config, overrides)
+    models = load_models(chosen.config, chosen.set)
 
     with importing():
         from torchfsid.commands.on_logs import observe_log
 
-    observe_log(log, models, folder, report)
+    observe_log(chosen.log, models, folder, chosen.report, chosen.mcap, chosen.merge)
 
 
 def _check(log: Path, config: Path, folder: ResultsFolder | None, overrides: Sequence[str]) -> None:
