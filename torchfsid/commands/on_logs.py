@@ -7,6 +7,8 @@ from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
+from rich.markup import escape
+
 from torchfsid.commands import report
 from torchfsid.commands.check import check
 from torchfsid.commands.command_line import use_one_thread
@@ -104,6 +106,8 @@ def observe_log(
         report.print_hypotheses(run, folder.path, console())
     else:
         report.print_verdicts(run, folder.path, console())
+    if mcap is not None and mcap.exists():
+        console().print(escape(f"ROS messages: {mcap}"))
     if problems:
         raise problems[0]
 

@@ -6,6 +6,7 @@
                                                    at least every `RESENT`, and at the end
     /torchfsid/<robot>/centroid  PoseStamped       a point of Theta(t), at every time; likewise hybrid and ukf
     /torchfsid/<body>/odom       Odometry          what was observed, at every time at which it was
+    /tf                          TFMessage         the same as frames torchfsid/<body>
 
 All is in one frame: that of the bag's positions, otherwise `FRAME`. Regions and points are drawn where theta has two or
 three entries; other theta are told by the diagnostics only.
@@ -108,8 +109,14 @@ class RunInMcap:
         k = int(np.argmin(np.abs(self._log.t - float(estimate.t))))
         stamp = self._origin + round(float(estimate.t) * 1e9)
         self._write(stamp, "bodies", self._make.markers(self._bodies(k, stamp)))
+        places = {}
         for j in np.flatnonzero(self._log.seen[k]).tolist():
-            self._write(stamp, f"{self._topics[self._log.bodies[j]]}/odom", self._odometry(stamp, k, j))
+            name, heading = self._topics[self._log.bodies[j]], self._heading(k, j)
+            places[f"torchfsid/{name}"] = self._log.x[k, j], heading
+            self._write(
+                stamp, f"{name}/odom", self._make.odometry(stamp, self._log.x[k, j], self._velocity(k, j), heading)
+            )
+        self._file.write("/tf", stamp, self._make.transforms(stamp, places))
         self._write(stamp, "status", self._diagnostics(stamp, sets.status.tolist(), lines))
         if self._is_drawn:
             self._write_regions(stamp, sets.feasible_set, sets.status.tolist())
@@ -180,14 +187,16 @@ class RunInMcap:
                 stamp, "names", TEXT, (*colour, 1.0), 0.025 * self._size, j, at=log.x[k, j], text=body, action=action
             )
 
-    def _odometry(self, stamp: int, k: int, j: int) -> Any:
-        """What was observed of a body. A velocity or heading that is not known is zero."""
+    def _velocity(self, k: int, j: int) -> np.ndarray:
+        """The velocity of a body [m/s], zero where it is unknown."""
         log = self._log
-        u = log.u[k, j] if log.u is not None and log.velocity_known[k, j] else np.zeros(log.x.shape[-1])
-        heading = 0.0
-        if log.heading is not None and log.oriented is not None and log.oriented[k, j]:
-            heading = float(log.heading[k, j])
-        return self._make.odometry(stamp, log.x[k, j], u, heading)
+        return log.u[k, j] if log.u is not None and log.velocity_known[k, j] else np.zeros(log.x.shape[-1])
+
+    def _heading(self, k: int, j: int) -> float:
+        """The heading of a body [rad], zero where it is unknown."""
+        log = self._log
+        is_known = log.heading is not None and log.oriented is not None and bool(log.oriented[k, j])
+        return float(log.heading[k, j]) if is_known and log.heading is not None else 0.0
 
     def _diagnostics(self, stamp: int, status: Sequence[int], lines: Sequence[Sequence[str]]) -> Any:
         """The lines of estimates.csv."""

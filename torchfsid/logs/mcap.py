@@ -76,7 +76,10 @@ class McapFile:
         return self._store.types
 
     def write(self, topic: str, stamp: int, message: Any) -> None:
-        """Write a message with the time `stamp` [ns], after the bag's messages of earlier times."""
+        """Write a message with the time `stamp` [ns], after the bag's messages of earlier times.
+
+        A topic of the bag's is one topic, not two.
+        """
         if self.problem is not None:
             return
         try:
@@ -148,4 +151,4 @@ class McapFile:
             offered_qos_profiles=connection.ext.offered_qos_profiles,
             **told,
         )
-        return made
+        return self._connections.setdefault(connection.topic, made)

@@ -44,6 +44,16 @@ class Messages:
             twist=types["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=np.zeros(36)),
         )
 
+    def transforms(self, stamp: int, places: Mapping[str, tuple[Float[np.ndarray, "n"], float]]) -> Any:
+        """tf2_msgs/TFMessage: child frames, each with its position [m] and heading [rad]."""
+        types, sent = self.types, []
+        for child, (x, heading) in places.items():
+            pose = self._pose(x, heading)
+            moved = types["geometry_msgs/msg/Transform"](translation=self._vector(x), rotation=pose.orientation)
+            of = types["geometry_msgs/msg/TransformStamped"]
+            sent.append(of(header=self._header(stamp), child_frame_id=child, transform=moved))
+        return types["tf2_msgs/msg/TFMessage"](transforms=sent)
+
     def pose(self, stamp: int, x: Float[np.ndarray, "n"]) -> Any:
         """geometry_msgs/PoseStamped."""
         return self.types["geometry_msgs/msg/PoseStamped"](header=self._header(stamp), pose=self._pose(x))
