@@ -93,7 +93,7 @@ def test_what_is_read_back_is_the_results(log, tmp_path, gain):
             of_name = found[f"/torchfsid/{NAMED[robot]}/{name}"]
             assert [float(row["t"]) for row in mine] == pytest.approx([seconds(m) for _, m in of_name], abs=1e-9)
             here = [[m.pose.position.x, m.pose.position.y] for _, m in of_name]
-            np.testing.assert_allclose(here, [[float(row[f"{name}_{i}"]) for i in (0, 1)] for row in mine], rtol=1e-14)
+            assert here == [[float(row[f"{name}_{i}"]) for i in (0, 1)] for row in mine]
 
         course = found[f"/torchfsid/{NAMED[robot]}/region"]
         last = {marker.ns: marker for marker in course[-1][1].markers}
@@ -165,6 +165,18 @@ def test_refusals_come_first(log, tmp_path, capsys, options, changes, expected):
     assert code == 2
     assert expected in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_times_below_zero_are_none_of_ros(log, tmp_path, capsys):
+    earlier = tmp_path / "log.csv"
+    header, *lines = log.read_text().splitlines()
+    moved = [f"{float(line.partition(',')[0]) - 1},{line.partition(',')[2]}" for line in lines]
+    earlier.write_text("\n".join([header, *moved]))
+    config = tmp_path / "config.yaml"
+    config.write_text(yaml.safe_dump(CONFIG))
+    arguments = ["observe", str(earlier), "--config", str(config), "--out", str(tmp_path / "out")]
+    assert main([*arguments, "--mcap", str(tmp_path / "run.mcap")]) == 2
+    assert "the log begins at -1 s" in capsys.readouterr().err
 
 
 def test_without_the_extra(log, tmp_path, capsys, monkeypatch):

@@ -185,10 +185,10 @@ class Observation:
                 except InconsistentError as error:
                     raise FsidError(self._named(error)) from error
                 lines = results.write(measurement, estimate)
-                if viewed is not None:
-                    viewed.see(estimate, lines)
                 sets = of_sets(estimate)
                 motion.see(sets)
+                if viewed is not None:
+                    viewed.see(sets, lines)
                 for robot, case, used in zip(
                     self.robots, sets.kkt.case.tolist(), sets.informative.tolist(), strict=True
                 ):

@@ -62,6 +62,8 @@ def observe_log(
     if mcap is not None:
         _require_viewable(mcap, models, merge)
     log = _read(path, models)
+    if mcap is not None and log.t[0] < 0:
+        raise ConfigError(f"--mcap: ROS has no times below zero, and the log begins at {log.t[0]:g} s")
     run = _ready({name: DeclaredLog(model, log) for name, model in models.items()})
     of_each = run.observations if isinstance(run, Hypotheses) else {"": run}
     of_model = ("config.yaml", *FILES, *UNKNOWN_FILES, *([PAGE] if with_page else []))

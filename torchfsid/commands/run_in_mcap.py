@@ -27,12 +27,10 @@ import torch
 from torchfsid.commands.declared_log import DeclaredLog
 from torchfsid.commands.figures import ROBOT_COLOURS
 from torchfsid.commands.interruption import uninterrupted
-from torchfsid.commands.results import STATUS_NAMES, of_sets
+from torchfsid.commands.results import STATUS_NAMES
 from torchfsid.commands.safety_results import without_repeats
-from torchfsid.errors import ConfigError
 from torchfsid.logs.mcap import OURS, McapFile
 from torchfsid.logs.ros_messages import ADD, CYLINDER, DELETE, LINES, SPHERE, TEXT, TRIANGLES, Messages
-from torchfsid.observers.hybrid import HybridEstimate
 from torchfsid.observers.set_membership import SetEstimate
 from torchfsid.outcome import Status
 from torchfsid.sets.feasible_set import FeasibleSet
@@ -65,22 +63,18 @@ class RunInMcap:
         source: a bag whose messages are copied, too. None: none.
 
     Raises:
-        ConfigError: the log has times below zero, which ROS has not.
+        ConfigError: a type of the bag has no definition.
         OSError: the file cannot be made.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        declared: DeclaredLog,
-        header: Sequence[str],
-        source: Path | None = None,
-    ):
+    def __init__(self, path: Path, declared: DeclaredLog, header: Sequence[str], source: Path | None = None):
         log, robots, prior = declared.log, declared.robots, declared.prior
-        if log.t[0] < 0:
-            raise ConfigError(f"--mcap: ROS has no times below zero, and the log begins at {log.t[0]} s")
         self._file, self._log, self._robots = McapFile(path, source), log, list(robots)
         self._header = list(header)
+        self._points = {
+            name: [self._header.index(f"{name}_{i}") for i in range(prior.dim)]
+            for name in ("centroid", "hybrid", "ukf")
+        }
         self._make = Messages(self._file.types, log.frame or FRAME)
         self._origin = round((log.reading.time_origin or 0.0) * 1e9)
         self._topics = _topics(log.bodies)
@@ -89,7 +83,7 @@ class RunInMcap:
         self._is_drawn = prior.dim in (2, 3)
         self._priors = [_outline(prior, i) for i in range(len(robots))] if self._is_drawn else []
         self._told: list[tuple[float, int, int]] = [(math.inf, -1, 0)] * len(robots)
-        self._last: tuple[int, SetEstimate] | None = None
+        self._last: int | None = None
 
     def __enter__(self) -> RunInMcap:
         return self
@@ -98,48 +92,46 @@ class RunInMcap:
         with uninterrupted():
             self._file.close()
 
-    def see(self, estimate: HybridEstimate | SetEstimate, lines: Sequence[Sequence[str]]) -> None:
+    def see(self, sets: SetEstimate, lines: Sequence[Sequence[str]]) -> None:
         """Write the messages of one time.
 
         Args:
-            estimate: the estimates.
+            sets: the sets.
             lines: the lines of estimates.csv.
         """
-        sets = of_sets(estimate)
-        k = int(np.argmin(np.abs(self._log.t - float(estimate.t))))
-        stamp = self._origin + round(float(estimate.t) * 1e9)
+        k = int(np.argmin(np.abs(self._log.t - float(sets.t))))
+        stamp = self._origin + round(float(sets.t) * 1e9)
         self._write(stamp, "bodies", self._make.markers(self._bodies(k, stamp)))
         places = {}
         for j in np.flatnonzero(self._log.seen[k]).tolist():
             name, heading = self._topics[self._log.bodies[j]], self._heading(k, j)
-            places[f"torchfsid/{name}"] = self._log.x[k, j], heading
-            self._write(
-                stamp, f"{name}/odom", self._make.odometry(stamp, self._log.x[k, j], self._velocity(k, j), heading)
-            )
+            x, u = self._log.x[k, j], self._velocity(k, j)
+            places[f"torchfsid/{name}"] = x, heading
+            self._write(stamp, f"{name}/odom", self._make.odometry(stamp, x, u, heading))
         self._file.write("/tf", stamp, self._make.transforms(stamp, places))
         self._write(stamp, "status", self._diagnostics(stamp, sets.status.tolist(), lines))
         if self._is_drawn:
             self._write_regions(stamp, sets.feasible_set, sets.status.tolist())
-            points = {"centroid": sets.theta}
-            if isinstance(estimate, HybridEstimate):
-                points |= {"hybrid": estimate.theta, "ukf": estimate.ukf_estimate.theta}
-            for name, theta in points.items():
-                self._write_points(stamp, name, theta.detach().cpu().numpy())
-        self._last = stamp, sets
+            self._write_points(stamp, lines)
+        self._last = stamp
 
     def finish(self, sets: FeasibleSet, status: Sequence[int]) -> None:
         """Write the final regions, at the time of the last sample."""
         if self._last is not None and self._is_drawn:
             self._told = [(math.inf, -1, 0)] * len(self._robots)
-            self._write_regions(self._last[0], sets, status)
+            self._write_regions(self._last, sets, status)
 
     def _write(self, stamp: int, topic: str, message: Any) -> None:
         self._file.write(f"{OURS}{topic}", stamp, message)
 
-    def _write_points(self, stamp: int, name: str, theta: np.ndarray) -> None:
-        for robot, point in zip(self._robots, theta, strict=True):
-            if np.isfinite(point).all():
-                self._write(stamp, f"{self._topics[robot]}/{name}", self._make.pose(stamp, point))
+    def _write_points(self, stamp: int, lines: Sequence[Sequence[str]]) -> None:
+        """Write the points that estimates.csv has."""
+        for robot, line in zip(self._robots, lines, strict=True):
+            for name, columns in self._points.items():
+                cells = [line[column] for column in columns]
+                if all(cells):
+                    point = self._make.pose(stamp, np.array(list(map(float, cells))))
+                    self._write(stamp, f"{self._topics[robot]}/{name}", point)
 
     def _write_regions(self, stamp: int, sets: FeasibleSet, status: Sequence[int]) -> None:
         """Write the regions that have changed, or were not told for long."""

@@ -68,7 +68,12 @@ class McapFile:
         self._writer.open()
         self._connections: dict[str, Any] = {}
         self._copied = iter(()) if source is None else self._messages_of(source)
-        self._next: tuple[Any, int, bytes] | None = next(self._copied, None)
+        try:
+            self._next: tuple[Any, int, bytes] | None = next(self._copied, None)
+        except BaseException:
+            self._writer.abort()
+            shutil.rmtree(self._folder, ignore_errors=True)
+            raise
 
     @property
     def types(self) -> Any:
