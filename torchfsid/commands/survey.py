@@ -13,7 +13,7 @@ The gain of an avoidance barrier, h = |dx|^2 - Ds^2, is the smallest that forbid
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -126,7 +126,7 @@ def survey(log: Log) -> Survey:
     controls, known = log.controls
     has_controls = controls is not None
     if controls is None:
-        differences = log.differentiated()
+        differences = replace(log, heading=None, oriented=None).differentiated()
         assert differences.u is not None
         last = np.zeros_like(log.x[:1])
         controls = np.concatenate([differences.u, last])

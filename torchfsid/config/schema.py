@@ -21,6 +21,8 @@ from torchfsid.config.observe import ObserveConfig
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
+LIMITS = {"gt": "exclusiveMinimum", "ge": "minimum", "lt": "exclusiveMaximum", "le": "maximum"}
+
 BOUND = {"anyOf": [{"type": "number", "minimum": 0}, {"const": "auto"}]}
 NAME = {"type": ["string", "integer"]}
 """A body in a list may be written as a number."""
@@ -52,7 +54,8 @@ def schema() -> dict[str, Any]:
     del sections["ObserveConfig"]
     made["required"] = ["noise"]
     made["oneOf"] = [{"required": ["task", "barriers", "prior"]}, {"required": ["tasks"]}]
-    return {"$schema": DIALECT, "title": "torchfsid observe", **made, "$defs": sections}
+    made["title"] = "torchfsid observe"
+    return {"$schema": DIALECT, **_with_limits({**made, "$defs": sections})}
 
 
 def print_schema() -> None:
@@ -96,6 +99,16 @@ def _explain(section: dict[str, Any], model: type[BaseModel]) -> None:
         value.pop("title", None)
         if key == "kind":
             section["required"] = list(dict.fromkeys(["kind", *section.get("required", [])]))
+
+
+def _with_limits(node: Any) -> Any:
+    """The limits of numbers under their standard names: pydantic keeps its own behind a validator."""
+    if isinstance(node, dict):
+        return {
+            LIMITS.get(key, key) if not isinstance(value, dict) else key: _with_limits(value)
+            for key, value in node.items()
+        }
+    return [_with_limits(value) for value in node] if isinstance(node, list) else node
 
 
 def _leave_forms_open(sections: dict[str, Any], keys: dict[str, Any]) -> None:
