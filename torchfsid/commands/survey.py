@@ -222,7 +222,7 @@ def _goal(log: Log, controls: np.ndarray, known: np.ndarray, robots: np.ndarray)
     for j in robots.tolist():
         there = np.flatnonzero(known[:, j] & log.seen[:, j])
         tail = there[len(there) // 2 :]
-        free = (sizes[tail, j] < 0.9 * sizes[known].max()) & (np.abs(controls[tail, j]) < 0.9 * largest).all(axis=-1)
+        free = (sizes[tail, j] < 0.9 * sizes[known].max()) & (np.abs(controls[tail, j]) <= 0.9 * largest).all(axis=-1)
         tail = tail[free & (sizes[tail, j] > 1e-6 * sizes[known].max())]
         of_axes = [-log.x[tail, j]] if log.a is None or log.u is None else [-log.x[tail, j], -log.u[tail, j]]
         columns.append(np.stack(of_axes, axis=-1).reshape(-1, len(of_axes)))
