@@ -3,17 +3,20 @@
 python tests/try_wheel.py WHEEL CONSTRAINTS         `make dist` does this
 """
 
+import json
+import math
 import os
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
+GOALS = {"a": (1.0, 2.0), "b": (-1.0, 0.0)}
 LOG = ["t,robot,x,y,vx,vy"]
 for k in range(40):
-    for robot, goal, start in (("a", 1.0, -1.0), ("b", -1.0, 1.0)):
-        x = goal + (start - goal) * 0.95**k  # a command 0.5 (goal - x), held for 0.1 s
-        LOG.append(f"{k / 10},{robot},{x!r},{2.0 if robot == 'a' else 0.0},{0.5 * (goal - x)!r},0.0")
+    for robot, (goal, y) in GOALS.items():
+        x = goal - 2 * goal * 0.95**k  # from -goal, with the command 0.5 (goal - x), held for 0.1 s
+        LOG.append(f"{k / 10},{robot},{x!r},{y},{0.5 * (goal - x)!r},0.0")
 
 
 def main(wheel: Path, constraints: Path) -> None:
@@ -50,6 +53,9 @@ def main(wheel: Path, constraints: Path) -> None:
         )
         for file in ("results/estimates.csv", "results/regions.json", "results/regions.png", "run.mcap"):
             assert (folder / file).stat().st_size > 0, file
+        regions = json.loads((folder / "results" / "regions.json").read_text())["robots"]
+        for robot, goal in GOALS.items():
+            assert math.dist(regions[robot]["centroid"], goal) < 1e-3, regions[robot]["centroid"]
     print(f"{wheel.name}: installed and tried outside the checkout")
 
 
