@@ -127,9 +127,10 @@ def _init(log: Path, out: Path) -> None:
 
 def _schema() -> None:
     with importing():
-        from torchfsid.config.schema import print_schema
+        from torchfsid.commands.terminal import console
+        from torchfsid.config.schema import schema_text
 
-    print_schema()
+    console().out(schema_text(), highlight=False)
 
 
 def _observe(chosen: argparse.Namespace, folder: ResultsFolder) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 from torchfsid.commands.starting_config import starting_config
 from torchfsid.commands.survey import survey
+from torchfsid.commands.terminal import console
 from torchfsid.errors import ConfigError
 from torchfsid.logs.read import read_log
 from torchfsid.logs.recognise import recognise
@@ -29,7 +31,8 @@ def write_config(path: Path, out: Path) -> None:
         file.write(content)
     moving, still = seen.names
     rest = f", {len(still)} that stand still" if still else ""
-    print(f"{path} is {found.what}: {len(moving)} bodies that move{rest}, {len(seen.log.t)} times.")
-    print(f"{out} is written. Edit the lines marked EDIT, then:")
-    print(f"  torchfsid check {path} --config {out}")
-    print(f"  torchfsid observe {path} --config {out} --out results")
+    shown = partial(console().out, highlight=False)
+    shown(f"{path} is {found.what}: {len(moving)} bodies that move{rest}, {len(seen.log.t)} times.")
+    shown(f"{out} is written. Edit the lines marked EDIT, then:")
+    shown(f"  torchfsid check {path} --config {out}")
+    shown(f"  torchfsid observe {path} --config {out} --out results")

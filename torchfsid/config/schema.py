@@ -58,9 +58,9 @@ def schema() -> dict[str, Any]:
     return {"$schema": DIALECT, **_with_limits({**made, "$defs": sections})}
 
 
-def print_schema() -> None:
-    """Print the schema on stdout: `torchfsid schema > torchfsid.schema.json`."""
-    print(json.dumps(schema(), indent=1))
+def schema_text() -> str:
+    """The schema as JSON: `torchfsid schema > torchfsid.schema.json`."""
+    return json.dumps(schema(), indent=1)
 
 
 def descriptions(model: type[BaseModel]) -> dict[str, str]:
