@@ -9,17 +9,20 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from rosbags.rosbag2 import Reader
+from rosbags.rosbag2 import Reader, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from tests.bag_writer import odometry_of, section_of, write_bag
 from tests.logs import write_log
 from torchfsid.cli import main
+from torchfsid.commands.run_in_mcap import outline
+from torchfsid.halfspaces import Halfspaces
 from torchfsid.logs.table_log import read_csv
 from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.simulation import simulate
 from torchfsid.robots.tasks import GoalTask
+from torchfsid.sets.feasible_set import FeasibleSet
 
 BODIES = ["7", "bob b", "pillar"]
 NAMED = {"7": "robot_7", "bob b": "bob_b", "pillar": "pillar"}
@@ -34,11 +37,11 @@ CONFIG = {
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """60 samples of two robots that pass each other beside a pillar."""
+    """30 samples of two robots that pass each other beside a pillar."""
     controller = CbfQpController(GoalTask(0.9), [CollisionAvoidance(ClassK(1.5), safety_distance=0.5)])
     start = torch.tensor([[-2.0, 0.0], [2.0, 0.3]], dtype=torch.float64)
     goals = torch.tensor([[2.0, 0.1], [-2.0, 0.0]], dtype=torch.float64)
-    run = simulate(controller, goals, start, dt=0.05, steps=60, obstacles=torch.tensor([[0.2, 1.0]]))
+    run = simulate(controller, goals, start, dt=0.08, steps=30, obstacles=torch.tensor([[0.2, 1.0]]))
     return write_log(tmp_path_factory.mktemp("log") / "log.csv", run, BODIES)
 
 
@@ -113,10 +116,10 @@ def test_what_is_read_back_is_the_results(log, tmp_path, gain):
 @pytest.mark.usefixtures("undrawn")
 def test_it_is_a_log_again(log, tmp_path):
     """Positions and velocities of all bodies, as they were: observed again, the same sets."""
-    made = observed(log, tmp_path)
+    made = observed(log, tmp_path, ukf=False)
     (tmp_path / "again").mkdir()
     bag = {"topics": {f"/torchfsid/{name}/odom": body for body, name in NAMED.items()}}
-    observed(made, tmp_path / "again", bag=bag)
+    observed(made, tmp_path / "again", bag=bag, ukf=False)
     first, second = (
         json.loads((folder / "out" / "regions.json").read_text())["robots"] for folder in (tmp_path, tmp_path / "again")
     )
@@ -130,7 +133,7 @@ def test_beside_the_messages_of_a_bag(log, tmp_path):
     source = read_csv(log)
     bag = write_bag(tmp_path / "bag", odometry_of(source))
     before = messages(bag)
-    after = messages(observed(bag, tmp_path, "--merge", bag=section_of(source)))
+    after = messages(observed(bag, tmp_path, "--merge", bag=section_of(source), ukf=False))
     for topic, of_topic in before.items():
         assert [time for time, _ in after[topic]] == [time for time, _ in of_topic]
     assert len(after["/torchfsid/status"]) == len(source.t)
@@ -191,16 +194,31 @@ def test_without_the_extra(log, tmp_path, capsys, monkeypatch):
 @pytest.mark.usefixtures("undrawn")
 def test_a_full_disk_leaves_no_half_file(log, tmp_path, monkeypatch, capsys):
     """The sets are still there, and the error says which file is missing."""
-    from rosbags.rosbag2 import Writer
 
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Writer, "write", full)
     config = tmp_path / "config.yaml"
-    config.write_text(yaml.safe_dump(CONFIG))
+    config.write_text(yaml.safe_dump({**CONFIG, "ukf": False}))
     arguments = ["observe", str(log), "--config", str(config), "--out", str(tmp_path / "out")]
     assert main([*arguments, "--mcap", str(tmp_path / "run.mcap")]) == 1
     assert f"{tmp_path}/run.mcap: No space left on device" in capsys.readouterr().err
     assert (tmp_path / "out" / "regions.json").exists()
     assert not list(tmp_path.glob("run.mcap*"))
+
+
+@pytest.mark.parametrize("cuts", [0, 1, 12])
+def test_edges_of_a_set_in_space(cuts):
+    """Euler: vertices - edges + faces = 2. Every edge lies on two faces, every vertex has three edges or more."""
+    ones = torch.ones(1, 3, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(7)
+    A = torch.randn(1, cuts, 3, generator=generator, dtype=torch.float64)
+    sets = FeasibleSet.from_box(-ones, ones).intersect(Halfspaces(A, 0.7 * A.norm(dim=-1)))
+    vertices, edges = outline(sets, 0)
+    rows = sets.facets().halfspaces
+    gaps = np.abs(vertices @ rows.A[0].numpy().T - rows.b[0].numpy())
+    faces = int(((gaps < 1e-9).sum(axis=0) >= 3).sum())
+    assert len(vertices) - len(edges) + faces == 2
+    assert ((gaps[edges] < 1e-9).all(axis=1).sum(axis=1) == 2).all()
+    assert np.bincount(edges.reshape(-1)).min() >= 3

@@ -188,7 +188,7 @@ class Observation:
                 sets = of_sets(estimate)
                 motion.see(sets)
                 if viewed is not None:
-                    viewed.see(sets, lines)
+                    viewed.see(float(sets.t), sets.feasible_set, sets.status.tolist(), lines)
                 for robot, case, used in zip(
                     self.robots, sets.kkt.case.tolist(), sets.informative.tolist(), strict=True
                 ):

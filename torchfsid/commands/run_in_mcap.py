@@ -31,7 +31,6 @@ from torchfsid.commands.results import STATUS_NAMES
 from torchfsid.commands.safety_results import without_repeats
 from torchfsid.logs.mcap import OURS, McapFile
 from torchfsid.logs.ros_messages import ADD, CYLINDER, DELETE, LINES, SPHERE, TEXT, TRIANGLES, Messages
-from torchfsid.observers.set_membership import SetEstimate
 from torchfsid.outcome import Status
 from torchfsid.sets.feasible_set import FeasibleSet
 
@@ -81,7 +80,7 @@ class RunInMcap:
         x = log.x[log.seen]
         self._size = max(float((x.max(axis=0) - x.min(axis=0)).max()), 1e-3)
         self._is_drawn = prior.dim in (2, 3)
-        self._priors = [_outline(prior, i) for i in range(len(robots))] if self._is_drawn else []
+        self._priors = [outline(prior, i) for i in range(len(robots))] if self._is_drawn else []
         self._told: list[tuple[float, int, int]] = [(math.inf, -1, 0)] * len(robots)
         self._last: int | None = None
 
@@ -92,15 +91,17 @@ class RunInMcap:
         with uninterrupted():
             self._file.close()
 
-    def see(self, sets: SetEstimate, lines: Sequence[Sequence[str]]) -> None:
+    def see(self, t: float, sets: FeasibleSet, status: Sequence[int], lines: Sequence[Sequence[str]]) -> None:
         """Write the messages of one time.
 
         Args:
-            sets: the sets.
+            t: the time [s].
+            sets: the set of each robot.
+            status: a `Status` for each robot.
             lines: the lines of estimates.csv.
         """
-        k = int(np.argmin(np.abs(self._log.t - float(sets.t))))
-        stamp = self._origin + round(float(sets.t) * 1e9)
+        k = int(np.argmin(np.abs(self._log.t - t)))
+        stamp = self._origin + round(t * 1e9)
         self._write(stamp, "bodies", self._make.markers(self._bodies(k, stamp)))
         places = {}
         for j in np.flatnonzero(self._log.seen[k]).tolist():
@@ -109,9 +110,9 @@ class RunInMcap:
             places[f"torchfsid/{name}"] = x, heading
             self._write(stamp, f"{name}/odom", self._make.odometry(stamp, x, u, heading))
         self._file.write("/tf", stamp, self._make.transforms(stamp, places))
-        self._write(stamp, "status", self._diagnostics(stamp, sets.status.tolist(), lines))
+        self._write(stamp, "status", self._diagnostics(stamp, status, lines))
         if self._is_drawn:
-            self._write_regions(stamp, sets.feasible_set, sets.status.tolist())
+            self._write_regions(stamp, sets, status)
             self._write_points(stamp, lines)
         self._last = stamp
 
@@ -140,7 +141,7 @@ class RunInMcap:
             cut, told, at = self._told[i]
             if (cuts[i], int(status[i])) != (cut, told) or stamp - at >= RESENT:
                 self._told[i] = cuts[i], int(status[i]), stamp
-                markers = self._region(i, _outline(sets, i), Status(int(status[i])), stamp)
+                markers = self._region(i, outline(sets, i), Status(int(status[i])), stamp)
                 self._write(stamp, f"{self._topics[robot]}/region", self._make.markers(markers))
 
     def _region(self, i: int, outline: tuple[np.ndarray, np.ndarray], status: Status, stamp: int) -> Iterator[Any]:
@@ -202,8 +203,8 @@ class RunInMcap:
         )
 
 
-def _outline(sets: FeasibleSet, i: int) -> tuple[np.ndarray, np.ndarray]:
-    """The vertices of a set, and its edges as pairs of vertices: those that share all facets but p - 1 fewer.
+def outline(sets: FeasibleSet, i: int) -> tuple[np.ndarray, np.ndarray]:
+    """The vertices of a set, and its edges as pairs of vertices: those that lie on p - 1 facets together.
 
     In the plane the vertices go round. An empty set has none.
     """

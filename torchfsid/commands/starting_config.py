@@ -63,6 +63,7 @@ def _head(path: Path, out: Path, found: Recognised, seen: Survey) -> list[str]:
         "# the log fits this model, and for the sets:",
         f"#   torchfsid check {path} --config {out}",
         f"#   torchfsid observe {path} --config {out} --out results",
+        "# The value of a key with which the log fits best: add --scan barriers.0.class_k.gain=0.1:50 to check.",
         "# Editors with yaml-language-server complete and check the keys if you run",
         "#   torchfsid schema > torchfsid.schema.json",
         "# and make this the first line:",
