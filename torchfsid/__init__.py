@@ -9,6 +9,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+__version__ = "0.2.0"
+
 if TYPE_CHECKING:
     from torchfsid.halfspaces import Halfspaces as Halfspaces
     from torchfsid.identification.active_set import active_set as active_set

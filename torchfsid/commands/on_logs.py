@@ -7,6 +7,8 @@ from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
+from rich.markup import escape
+
 from torchfsid.commands import report
 from torchfsid.commands.check import check
 from torchfsid.commands.command_line import use_one_thread
@@ -22,8 +24,9 @@ from torchfsid.commands.terminal import console, status, track
 from torchfsid.config.documents import dump
 from torchfsid.config.models import dump_models
 from torchfsid.config.observe import ObserveConfig
-from torchfsid.errors import FigureError
+from torchfsid.errors import ConfigError, FigureError
 from torchfsid.logs.log import Log
+from torchfsid.logs.mcap import require_new_mcap
 from torchfsid.logs.read import read_log
 
 FILES = ("estimates.csv", "sets.csv", "motion.csv", "regions.json", "regions.png", "regions.pdf")
@@ -36,15 +39,31 @@ CHECKED = "check.json"
 
 
 def observe_log(
-    path: Path, models: Mapping[str, ObserveConfig], folder: ResultsFolder, with_page: bool = False
+    path: Path,
+    models: Mapping[str, ObserveConfig],
+    folder: ResultsFolder,
+    with_page: bool = False,
+    mcap: Path | None = None,
+    merge: bool = False,
 ) -> None:
     """`torchfsid observe`: infer the sets of a log's robots, under one model or under several hypotheses.
 
-    A file that cannot be written or drawn is reported at the end, after everything else is done. `with_page` writes
-    report.html, too.
+    A file that cannot be written or drawn is reported at the end, after everything else is done.
+
+    Args:
+        path: the log.
+        models: the models, by name.
+        folder: the results folder.
+        with_page: write report.html, too.
+        mcap: a new file for the run as ROS messages. None: there is none.
+        merge: copy the messages of the log, a bag, into it.
     """
     use_one_thread()
+    if mcap is not None:
+        _require_viewable(mcap, models, merge)
     log = _read(path, models)
+    if mcap is not None and log.t[0] < 0:
+        raise ConfigError(f"--mcap: ROS has no times below zero, and the log begins at {log.t[0]:g} s")
     run = _ready({name: DeclaredLog(model, log) for name, model in models.items()})
     of_each = run.observations if isinstance(run, Hypotheses) else {"": run}
     of_model = ("config.yaml", *FILES, *UNKNOWN_FILES, *([PAGE] if with_page else []))
@@ -68,7 +87,8 @@ def observe_log(
                 write_json(out / "unknown_numbers.json", observation.narrowing.to_json())
                 if "task.gain" in observation.narrowing.numbers:
                     write_json(out / "task_gain.json", observation.narrowing.numbers["task.gain"].to_json())
-            observation.run(out, partial(track, what=f"Observing {name}".strip(), total=observation.samples))
+            shown = partial(track, what=f"Observing {name}".strip(), total=observation.samples)
+            observation.run(out, shown, mcap, path if merge else None)
             with status("Drawing"):
                 seen = observation.log
                 draw_observation(out, seen.x, seen.seen, seen.bodies)
@@ -88,6 +108,8 @@ def observe_log(
         report.print_hypotheses(run, folder.path, console())
     else:
         report.print_verdicts(run, folder.path, console())
+    if mcap is not None and mcap.exists():
+        console().print(escape(f"ROS messages: {mcap}"))
     if problems:
         raise problems[0]
 
@@ -108,6 +130,19 @@ def check_log(path: Path, models: Mapping[str, ObserveConfig], folder: ResultsFo
     report.print_reading(log.reading, shown)
     for name, of_model in found.items():
         report.print_check(of_model, name, shown)
+
+
+def _require_viewable(mcap: Path, models: Mapping[str, ObserveConfig], merge: bool) -> None:
+    """Check that these models can be observed into an MCAP file.
+
+    Raises:
+        ConfigError: they cannot.
+    """
+    require_new_mcap(mcap)
+    if len(models) > 1:
+        raise ConfigError("--mcap: one model at a time, and the config has several hypotheses")
+    if merge and next(iter(models.values())).bag is None:
+        raise ConfigError("--merge: copies the messages of a ROS bag, and the config has no section bag")
 
 
 def _read(path: Path, models: Mapping[str, ObserveConfig]) -> Log:

@@ -44,6 +44,9 @@ class ResultsWriter:
     Use it as a context manager. A file that cannot be written (full disk) does not end the run: it stops after its
     last whole sample, and the error is raised on leaving.
 
+    Attributes:
+        header: names of the columns of estimates.csv.
+
     Args:
         out: the folder. It is made if it does not exist.
         robots: names of the inferred robots, in the order of the batch.
@@ -73,7 +76,15 @@ class ResultsWriter:
     def __enter__(self) -> ResultsWriter:
         self.out.mkdir(parents=True, exist_ok=True)
         p = self.observer.feasible_set.dim
-        header = ["t", "robot", "case", "n_active", *set_columns(p), *_indexed("ukf", p), *_indexed("hybrid", p)]
+        self.header = header = [
+            "t",
+            "robot",
+            "case",
+            "n_active",
+            *set_columns(p),
+            *_indexed("ukf", p),
+            *_indexed("hybrid", p),
+        ]
         header += [*([] if self._safety is None else COLUMNS), "status"]
         for prefix in self.others:
             header += [f"{prefix}_{name}" for name in (*set_columns(p), "status")]
@@ -103,8 +114,8 @@ class ResultsWriter:
         measurement: Measurement,
         estimate: HybridEstimate | SetEstimate,
         others: Mapping[str, SetEstimate] = MappingProxyType({}),
-    ) -> None:
-        """Write one line per robot for the time of `estimate`."""
+    ) -> list[list[str]]:
+        """Write one line per robot for the time of `estimate`, and return these lines of estimates.csv."""
         sets, blank = of_sets(estimate), [[""] * self.observer.feasible_set.dim] * len(self.robots)
         ukf, hybrid = blank, blank
         if isinstance(estimate, HybridEstimate):
@@ -128,6 +139,7 @@ class ResultsWriter:
         self._estimates.write(rows)
         sizes = [(_value(volume), _value(diameter)) for volume, diameter, *_ in described]
         self._sets.see(float(estimate.t), sets.feasible_set, sizes)
+        return rows
 
 
 def of_sets(estimate: HybridEstimate | SetEstimate) -> SetEstimate:
