@@ -28,6 +28,7 @@ import numpy as np
 
 from torchfsid.kernels.compiled import item, item_of_ordered, launcher
 from torchfsid.kernels.linear import solve_rows
+from torchfsid.kernels.simple_polyhedron import take_out
 from torchfsid.outcome import Outcome
 from torchfsid.tolerances import ROUND_OFF
 
@@ -40,8 +41,8 @@ SUBSETS = np.array([[0, 1, 2], [0, 1, -1], [0, 2, -1], [1, 2, -1], [0, -1, -1], 
 
 
 class Marks(NamedTuple):
-    """Places for cuts: for each vertex a.z - c, its state and its new number, a stack of vertices, for each line an
-    open end of an edge on it (all -1), and small systems (6, 3, 3)."""
+    """Places for cuts: for each vertex a.z - c and its state, for each new vertex the end of the edge that it closes, a
+    stack of vertices, for each line an open end of an edge on it (all -1), and small systems (6, 3, 3)."""
 
     over: Any
     state: Any
@@ -161,42 +162,46 @@ def cut_polyhedron(graph, spare, n, lines, first_row, reach, tolerance, cutting,
 def _drop(graph, spare, n, line, slack, inner, outer, marks):
     """Drop the vertices beyond the row `line` and close the polyhedron along it. Returns its vertex count."""
     points, meets, near = graph
-    new_points, new_meets, new_near = spare
-    over, state, stack, place, half = marks.over, marks.state, marks.stack, marks.place, marks.half
+    over, state, place, stack = marks.over, marks.state, marks.place, marks.stack
     for v in range(n):
         state[v] = BEYOND if over[v] >= -slack else INSIDE
     _spread(near, outer, state, BEYOND, DROPPED, stack)
     _spread(near, inner, state, INSIDE, KEPT, stack)
-    m = 0
-    for v in range(n):
-        if state[v] == KEPT:
-            place[v] = m
-            for j in range(3):
-                new_points[m, j], new_meets[m, j] = points[v, j], meets[v, j]
-            m += 1
+    gone = new = 0
     for v in range(n):
         if state[v] != KEPT:
-            continue
-        for j in range(3):
-            w = near[v, j]
-            if state[w] == KEPT:
-                new_near[place[v], j] = place[w]
+            stack[gone] = v
+            gone += 1
+    for s in range(gone):
+        w = stack[s]
+        for e in range(3):
+            v = near[w, e]
+            if state[v] != KEPT:
                 continue
+            j = 0 if near[v, 0] == w else 1 if near[v, 1] == w else 2
             share = 1.0 if over[w] <= slack else 0.0 if over[v] >= 0 else over[v] / (over[v] - over[w])
             for i in range(3):
-                new_points[m, i] = (
-                    points[w, i] if share == 1.0 else points[v, i] + share * (points[w, i] - points[v, i])
-                )
+                end = points[w, i] if share == 1.0 else points[v, i] + share * (points[w, i] - points[v, i])
+                spare.points[new, i] = end
             p, q = meets[v, (j + 1) % 3], meets[v, (j + 2) % 3]
-            new_meets[m, 0], new_meets[m, 1], new_meets[m, 2] = line, p, q
-            new_near[place[v], j], new_near[m, 0] = m, place[v]
-            _join(half, p, 3 * m + 2, new_near)
-            _join(half, q, 3 * m + 1, new_near)
-            m += 1
-    for v in range(m):
+            spare.meets[new, 0], spare.meets[new, 1], spare.meets[new, 2] = line, p, q
+            _join(marks.half, p, 3 * new + 2, spare.near)
+            _join(marks.half, q, 3 * new + 1, spare.near)
+            place[new] = 3 * v + j
+            new += 1
+    # The new vertices take the numbers of the dropped ones, and then those after the last one.
+    for t in range(gone, new):
+        stack[t] = n + t - gone
+    for t in range(new):
+        v, kept = stack[t], place[t]
         for j in range(3):
-            points[v, j], meets[v, j], near[v, j] = new_points[v, j], new_meets[v, j], new_near[v, j]
-    return m
+            points[v, j], meets[v, j] = spare.points[t, j], spare.meets[t, j]
+        near[v, 0], near[v, 1], near[v, 2] = kept // 3, stack[spare.near[t, 1]], stack[spare.near[t, 2]]
+        near[kept // 3, kept % 3] = v
+    n += max(new - gone, 0)
+    for s in range(gone - 1, new - 1, -1):
+        n = take_out(graph, stack[s], n)
+    return n
 
 
 @item

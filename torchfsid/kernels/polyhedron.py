@@ -13,7 +13,7 @@ from torchfsid.kernels.compiled import item, launcher
 from torchfsid.kernels.cutting import EMPTY, cut_polyhedron, mark_cuts, marks_of
 from torchfsid.kernels.roofs import merge, roof_of
 from torchfsid.kernels.simple_polyhedron import copy, find_facets, graph_of, link, pad, widened
-from torchfsid.kernels.solid import frame_of, to_axes, volume_of
+from torchfsid.kernels.solid import frame_of, volume_of
 from torchfsid.tolerances import ROUND_OFF
 
 
@@ -32,7 +32,7 @@ def clip(polyhedra, A, b, stamp, source, first_label, most):
     (B, R), F = b.shape, own_b.shape[1]
     L = F + R  # lines: first the facets, then the rows
     tolerance, depth, cutting, box = np.empty(R), np.empty(R), np.empty(R, np.int64), np.empty((3, 2))
-    lines, proof, far = np.empty((L, 4)), np.full(4, -1), np.empty(3)
+    lines, proof, far, centre = np.empty((L, 4)), np.full(4, -1), np.empty(3), np.empty(3)
     edges, at = np.full((L, L), -1), np.full(L, -1)
     graph, spare, marks = graph_of(2 * L), graph_of(2 * L), marks_of(2 * L, L)
     frame, roof = frame_of(2 * L), roof_of(L)
@@ -63,9 +63,12 @@ def clip(polyhedra, A, b, stamp, source, first_label, most):
                     lost[3][k, i] = own_source[k, e] if e < F else source[k, e - F]
         if shrunk[k] and (n + 4) // 2 > most:
             n = merge(graph, n, lines, most, far, at, frame, roof)
-            larger = _content(graph.points, graph.meets, n, far, edges, spare.near, at, frame)
-            smaller = _content(points[k], meets[k], 2 * count[k] - 4, reach[k], edges, spare.near, at, frame)
-            # Each volume carries the round-off of its sum.
+            larger = volume_of(frame.y, graph.meets, graph.near, at, 3, centre)
+            # The volume before, in the same frame. Each volume carries the round-off of its sum.
+            _to_frame(points, k, 2 * count[k] - 4, frame)
+            link(meets[k], 2 * count[k] - 4, edges, spare.near)
+            find_facets(meets[k], 2 * count[k] - 4, at)
+            smaller = volume_of(frame.y, meets[k], spare.near, at, 3, centre)
             shrunk[k] = larger <= smaller * (1 - ROUND_OFF)
         if not shrunk[k]:
             if slots > 0:
@@ -151,10 +154,11 @@ def _store(polyhedra, k, graph, n, lines, far, at, stamp, source, first_label, e
 
 @item
 @no_type_check
-def _content(points, meets, n, reach, edges, near, at, frame):
-    """The volume. That of a flat set is a multiple of round-off."""
-    link(meets, n, edges, near)
-    find_facets(meets, n, at)
-    wide = to_axes(points, n, reach, frame.y, frame.middle, frame.axes, frame.scale)
-    volume = volume_of(frame.y, meets, near, at, wide, frame.middle)
-    return volume * frame.scale[0] * frame.scale[1] * frame.scale[2]
+def _to_frame(points, k, n, frame):
+    """Fill y of a frame with the vertices of polyhedron k."""
+    for v in range(n):
+        for i in range(3):
+            frame.y[v, i] = 0.0
+            for j in range(3):
+                frame.y[v, i] += (points[k, v, j] - frame.middle[j]) * frame.axes[i, j]
+            frame.y[v, i] /= frame.scale[i]

@@ -17,7 +17,8 @@ from typing import Any, NamedTuple, no_type_check
 import numpy as np
 
 from torchfsid.kernels.compiled import item, launcher
-from torchfsid.kernels.simple_polyhedron import along, determinant, find_facets
+from torchfsid.kernels.ring import after_in, before_in
+from torchfsid.kernels.simple_polyhedron import along, determinant, find_facets, take_out
 from torchfsid.kernels.solid import to_axes
 from torchfsid.tolerances import PARALLEL_ROWS, ROUND_OFF
 
@@ -27,8 +28,14 @@ FAR = 100.0
 CLOSE = 1e-11
 """Share of the set's size by which a new vertex may exceed another facet of the roof."""
 
+SHARP = 1e-3
+"""Determinant of three unit rows below which their point is refined."""
+
 UNKNOWN = -1.0
 """The cost of a facet that has to be computed."""
+
+CANDIDATES = 4
+"""Of the facets that could be dropped, this many, the smallest, are compared by the volume that they keep out."""
 
 
 class Roof(NamedTuple):
@@ -37,6 +44,8 @@ class Roof(NamedTuple):
     Attributes:
         framed: the unit row, bound and round-off of each facet in the frame.
         cost: the volume that each facet keeps out.
+        area: its area.
+        tried: whether it has been considered.
         around: the facets around the facet.
         corner: the vertices around it.
         ring: those facets that have not vanished yet.
@@ -52,6 +61,8 @@ class Roof(NamedTuple):
 
     framed: Any
     cost: Any
+    area: Any
+    tried: Any
     around: Any
     corner: Any
     ring: Any
@@ -68,9 +79,9 @@ class Roof(NamedTuple):
 @no_type_check
 def roof_of(L):
     return Roof(
-        np.zeros((L, 5)), np.zeros(L), np.zeros(L, np.int64), np.zeros(L, np.int64), np.zeros(L, np.int64),
-        np.zeros((L, 3)), np.zeros(L, np.int64), np.zeros((L, 3)), np.zeros(L), np.zeros((L, 3)),
-        np.zeros((L, 3), np.int64), np.zeros((L, 3), np.int64),
+        np.zeros((L, 5)), np.zeros(L), np.zeros(L), np.zeros(L, np.bool_), np.zeros(L, np.int64),
+        np.zeros(L, np.int64), np.zeros(L, np.int64), np.zeros((L, 3)), np.zeros(L, np.int64), np.zeros((L, 3)),
+        np.zeros(L), np.zeros((L, 3)), np.zeros((L, 3), np.int64), np.zeros((L, 3), np.int64),
     )  # fmt: skip
 
 
@@ -86,21 +97,56 @@ def merge(graph, n, lines, most, reach, at, frame, roof):
     for f in range(len(at)):
         if at[f] >= 0:
             _to_frame(lines, f, reach, frame, roof.framed)
-        roof.cost[f] = UNKNOWN if at[f] >= 0 else np.inf
+            roof.cost[f] = UNKNOWN
+            roof.area[f] = _area(graph, f, at[f], frame.y)
     while (n + 4) // 2 > most:
-        f = 0
-        for e in range(len(at)):
-            if roof.cost[e] == UNKNOWN:
-                roof.cost[e] = _raise(graph, e, at, frame.y, roof)[0]
-            f = e if roof.cost[e] < roof.cost[f] else f
-        if roof.cost[f] == np.inf:
+        f = _cheapest(graph, at, frame.y, roof)
+        if f < 0:
             break
         _, k = _raise(graph, f, at, frame.y, roof)
-        n, roof.cost[f] = _build(graph, n, k, reach, frame, roof), np.inf
+        n = _build(graph, n, k, reach, frame, roof)
         find_facets(graph.meets, n, at)
         for i in range(k):
-            roof.cost[roof.around[i]] = UNKNOWN
+            e = roof.around[i]
+            roof.cost[e], roof.area[e] = UNKNOWN, _area(graph, e, at[e], frame.y)
     return n
+
+
+@item
+@no_type_check
+def _cheapest(graph, at, y, roof):
+    """Of the smallest facets the one that keeps out the least volume; -1 if none can be dropped."""
+    best, tried = -1, 0
+    for f in range(len(at)):
+        roof.tried[f] = at[f] < 0
+    while tried < CANDIDATES or best < 0:
+        f = -1
+        for e in range(len(at)):
+            if not roof.tried[e] and (f < 0 or roof.area[e] < roof.area[f]):
+                f = e
+        if f < 0:
+            break
+        tried, roof.tried[f] = tried + 1, True
+        if roof.cost[f] == UNKNOWN:
+            roof.cost[f] = _raise(graph, f, at, y, roof)[0]
+        if roof.cost[f] < np.inf and (best < 0 or roof.cost[f] < roof.cost[best]):
+            best = f
+    return best
+
+
+@item
+@no_type_check
+def _area(graph, f, first, y):
+    """Four times the square of the area of facet f in the frame, from one of its vertices on."""
+    last = along(graph.meets, graph.near, first, -1, f)
+    v = along(graph.meets, graph.near, last, first, f)
+    a = b = c = 0.0
+    while v != first:
+        p, q, r = y[last, 0] - y[first, 0], y[last, 1] - y[first, 1], y[last, 2] - y[first, 2]
+        s, t, u = y[v, 0] - y[first, 0], y[v, 1] - y[first, 1], y[v, 2] - y[first, 2]
+        a, b, c = a + q * u - r * t, b + r * s - p * u, c + p * t - q * s
+        v, last = along(graph.meets, graph.near, v, last, f), v
+    return a * a + b * b + c * c
 
 
 @item
@@ -134,16 +180,17 @@ def _raise(graph, f, at, y, roof):
     base0, base1, base2 = start[0, 0], start[0, 1], start[0, 2]
     total, level, left, new, changed, changes = 0.0, -roof.framed[f, 4] - CLOSE, k, 0, 0, k
     while True:
-        for e in range(changed, changed + changes):
-            _find_meet(roof, e % left, left, f)
+        for _ in range(changes):
+            _find_meet(roof, changed, left, f)
+            changed = after_in(changed, left)
         i = -1
         for e in range(left if left > 3 else 1):
             if level <= height[e] and (i < 0 or height[e] < height[i]):
                 i = e
         if i < 0 or not _is_inside(roof, i, left):
             return np.inf, k
-        level, before, after = max(level, height[i]), (i - 1) % left, (i + 1) % left
-        for e, to in ((before, i), (i, after), (after, (i + 2) % left)):
+        level, before, after = max(level, height[i]), before_in(i, left), after_in(i, left)
+        for e, to in ((before, i), (i, after), (after, after_in(after, left))):
             total += _over_triangle(start[e], start[to], meet[i], base0, base1, base2)
         for j in range(3):
             roof.apex[new, j] = meet[i, j]
@@ -159,7 +206,8 @@ def _raise(graph, f, at, y, roof):
             ring[e], gap[e], height[e] = ring[e + 1], gap[e + 1], height[e + 1]
             for j in range(3):
                 start[e, j], meet[e, j] = start[e + 1, j], meet[e + 1, j]
-        new, left, changed, changes = new + 1, left - 1, i - 1, 2
+        new, left, changes = new + 1, left - 1, 2
+        changed = before_in(i, left)
 
 
 @item
@@ -190,20 +238,20 @@ def _ring_around(graph, f, first, y, roof):
 def _find_meet(roof, i, k, f):
     """Find the point where facet i of the ring meets its neighbours, and its height over f; -inf if they do not meet.
 
-    By Cramer's rule from where its edge starts, with one step of refinement.
+    By Cramer's rule from where its edge starts, with a step of refinement where the facets are nearly dependent.
     """
     framed, ring, z = roof.framed, roof.ring, roof.meet[i]
-    u, v, w = framed[ring[(i - 1) % k]], framed[ring[i]], framed[ring[(i + 1) % k]]
+    u, v, w = framed[ring[before_in(i, k)]], framed[ring[i]], framed[ring[after_in(i, k)]]
     det = determinant(u, v, w)
     roof.height[i] = -np.inf
     if abs(det) <= PARALLEL_ROWS:
         return
     for j in range(3):
         z[j] = roof.start[i, j]
-    for _ in range(2):
+    for _ in range(1 if abs(det) > SHARP else 2):
         p, q, r = _room(u, z) / det, _room(v, z) / det, _room(w, z) / det
         for j in range(3):
-            a, b = (j + 1) % 3, (j + 2) % 3
+            a, b = after_in(j, 3), before_in(j, 3)
             z[j] += p * (v[a] * w[b] - v[b] * w[a]) + q * (w[a] * u[b] - w[b] * u[a]) + r * (u[a] * v[b] - u[b] * v[a])
     if max(abs(z[0]), abs(z[1]), abs(z[2])) <= FAR:
         roof.height[i] = -_room(framed[f], z)
@@ -256,20 +304,8 @@ def _build(graph, n, k, reach, frame, roof):
             if end >= 0:
                 v, w = roof.corner[t], end // 3 if end < 3 * size else roof.corner[end // 3 - size]
                 near[v, j], near[w, end % 3] = w, v
-    n = _take_out(graph, frame.y, max(roof.corner[k - 1], roof.corner[k - 2]), n)
-    return _take_out(graph, frame.y, min(roof.corner[k - 1], roof.corner[k - 2]), n)
-
-
-@item
-@no_type_check
-def _take_out(graph, y, v, n):
-    """Take one of n vertices out: the last one gets its number. Returns the number of vertices that are left."""
-    points, meets, near = graph
-    last = n - 1
-    if v != last:
+    for v in (max(roof.corner[k - 1], roof.corner[k - 2]), min(roof.corner[k - 1], roof.corner[k - 2])):
         for j in range(3):
-            points[v, j], meets[v, j], near[v, j], y[v, j] = points[last, j], meets[last, j], near[last, j], y[last, j]
-            w = near[last, j]
-            for i in range(3):
-                near[w, i] = v if near[w, i] == last else near[w, i]
-    return last
+            frame.y[v, j] = frame.y[n - 1, j]
+        n = take_out(graph, v, n)
+    return n

@@ -75,6 +75,21 @@ def along(meets, near, v, before, facet):
 
 @item
 @no_type_check
+def take_out(graph, v, n):
+    """Take one of n vertices out: the last one gets its number. Returns the number of vertices that are left."""
+    points, meets, near = graph
+    last = n - 1
+    if v != last:
+        for j in range(3):
+            points[v, j], meets[v, j], near[v, j] = points[last, j], meets[last, j], near[last, j]
+            w = near[last, j]
+            for i in range(3):
+                near[w, i] = v if near[w, i] == last else near[w, i]
+    return last
+
+
+@item
+@no_type_check
 def determinant(u, v, w):
     return u[0] * (v[1] * w[2] - v[2] * w[1]) - u[1] * (v[0] * w[2] - v[2] * w[0]) + u[2] * (v[0] * w[1] - v[1] * w[0])
 

@@ -21,7 +21,10 @@ from torchfsid.kernels.simple_polyhedron import along, determinant, find_facets,
 from torchfsid.tolerances import FLAT, PARALLEL_ROWS, ROUND_OFF
 
 SWEEPS = 30
-"""Sweeps of rotations after which the principal axes are taken as they are. Three to six are usual."""
+"""Sweeps of rotations after which the principal axes are taken as they are. Two to four are usual."""
+
+TILTED = 1e-3
+"""Cosine of the angle between two columns of coordinates below which the axes are principal axes, well enough."""
 
 TIED = 1e-9
 """Share of the set's size by which vertices may be less far than the farthest one and still be compared with it."""
@@ -108,7 +111,7 @@ def _rotate_all(y, n, axes):
                 a += y[v, i] * y[v, i]
                 b += y[v, j] * y[v, j]
                 c += y[v, i] * y[v, j]
-            if abs(c) <= ROUND_OFF * math.sqrt(a) * math.sqrt(b):
+            if abs(c) <= TILTED * math.sqrt(a) * math.sqrt(b):
                 continue
             turned = True
             half = (b - a) / (2 * c)
