@@ -219,8 +219,8 @@ def main(arguments: list[str]) -> None:
             )
         for peer in peers:
             what = found[peer]
-            print(f"  one set, {peer:11s} {what['microseconds'] or np.nan:9.1f} us, failed {what['failed']} of {what['of']}"
-                  f" {what['failures'] or ''}")  # fmt: skip
+            failed = f"failed {what['failed']} of {what['of']} {what['failures'] or ''}"
+            print(f"  one set, {peer:11s} {what['microseconds'] or np.nan:9.1f} us, {failed}")
     gain = {"polyhedron": unknown_gain(False, 200), "polytope": unknown_gain(True, 60)}
     results["unknown gain"] = gain
     print("\nunknown gain, one robot")

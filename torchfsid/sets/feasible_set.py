@@ -2,11 +2,10 @@ r"""The feasible set Theta(t): where the parameter must lie, given everything se
 
     Theta(t) = Theta_0  intersected with all  Omega(tau), tau <= t          Theta_0 a box, the prior
 
-A set is a value: `intersect` returns a new one. It is a batch of polygons in the plane, of polyhedra for p = 3, and of
-polytopes in other dimensions. All are differentiable. Up to round-off, a set contains the truth if all half-spaces do.
-Its volume never grows, and it stays bounded. The order of the half-spaces does not matter, and a smaller bound never
-gives a larger set. Its memory is that of its facets. More than `max_facets` are merged outward. Each facet keeps the
-time and the constraint that it came from.
+A set is a value: `intersect` returns a new one. It is a batch of polygons, of polyhedra for p = 3, or of polytopes. All
+are differentiable. Up to round-off, a set contains the truth if all half-spaces do. Its volume never grows, and it
+stays bounded. The order of the half-spaces does not matter, and a smaller bound never gives a larger set. Its memory is
+that of its facets. More than `max_facets` are merged outward. Each facet keeps its time and constraint.
 
 An EMPTY item has volume 0 and contains nothing. Its centroid, vertices, diameter, support, Chebyshev centre and nearest
 points are NaN. Its radius is minus the depth of the contradiction: the least distance by which the rows that contradict
