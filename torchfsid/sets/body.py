@@ -1,4 +1,4 @@
-"""The interface of a batch of sets: a `Polygon` in the plane, a `Polytope` in other dimensions."""
+"""The interface of a batch of sets: a `Polygon` in the plane, a `Polyhedron` for p = 3, else a `Polytope`."""
 
 from __future__ import annotations
 

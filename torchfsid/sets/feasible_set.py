@@ -2,11 +2,10 @@ r"""The feasible set Theta(t): where the parameter must lie, given everything se
 
     Theta(t) = Theta_0  intersected with all  Omega(tau), tau <= t          Theta_0 a box, the prior
 
-A set is a value: `intersect` returns a new one. It is a batch of polygons in the plane, and of polytopes in other
-dimensions. Both are differentiable. Up to round-off, a set contains the truth if all half-spaces do. Its volume never
-grows, and it stays bounded. The order of the half-spaces does not matter, and a smaller bound never gives a larger set.
-Its memory is that of its facets. More than `max_facets` are merged outward. Each facet keeps the time and the
-constraint that it came from.
+A set is a value: `intersect` returns a new one. It is a batch of polygons, of polyhedra for p = 3, or of polytopes. All
+are differentiable. Up to round-off, a set contains the truth if all half-spaces do. Its volume never grows, and it
+stays bounded. The order of the half-spaces does not matter, and a smaller bound never gives a larger set. Its memory is
+that of its facets. More than `max_facets` are merged outward. Each facet keeps its time and constraint.
 
 An EMPTY item has volume 0 and contains nothing. Its centroid, vertices, diameter, support, Chebyshev centre and nearest
 points are NaN. Its radius is minus the depth of the contradiction: the least distance by which the rows that contradict
@@ -31,6 +30,7 @@ from torchfsid.kernels import extent
 from torchfsid.outcome import Outcome
 from torchfsid.programmes.differentiable import inscribed_ball, symmetric
 from torchfsid.sets.polygon import Polygon
+from torchfsid.sets.polyhedron import Polyhedron
 from torchfsid.sets.polytope import Polytope
 
 MAX_FACETS = 32
@@ -65,7 +65,7 @@ class FeasibleSet:
     """A batch of bounded convex sets of parameters. Build it with `from_box`, shrink it with `intersect`.
 
     Attributes:
-        body: the sets with the batch flattened, a `Polygon` in the plane and a `Polytope` in other dimensions.
+        body: the sets with the batch flattened, a `Polygon` for p = 2, a `Polyhedron` for p = 3, else a `Polytope`.
         batch_shape: the shape of the batch.
         outcome: an `Outcome` per item. An EMPTY item contains nothing and stays empty, whatever its body.
         contradiction: the rows that no parameter satisfies together, for EMPTY items.
@@ -100,7 +100,7 @@ class FeasibleSet:
         batch, p = lower.shape[:-1], lower.shape[-1]
         if max_facets < 2 * p:
             raise InputError("max_facets", f"at least {2 * p}, the facets of the prior box", max_facets)
-        kind = Polygon if p == 2 else Polytope
+        kind = Polygon if p == 2 else Polyhedron if p == 3 else Polytope
         nothing = lower.new_full((*batch, p + 1), float("nan"))
         return cls(
             body=kind.from_box(lower.reshape(-1, p), upper.reshape(-1, p)),
