@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Literal
+from typing import Any, Literal, get_args
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -31,6 +31,7 @@ from torchfsid.identification.kkt import KktSolution
 from torchfsid.identification.windows import Windows
 from torchfsid.observers.outliers import SetAside, narrowed, possible, set_aside
 from torchfsid.outcome import Status
+from torchfsid.robots.arguments import require_choice, require_task
 from torchfsid.robots.barriers import Barrier
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.measurement import Measurement
@@ -137,10 +138,10 @@ class SetMembershipObserver:
     _below: tuple[FeasibleSet, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        p = len(self.task.parameter_names)
-        if len(self.feasible_set.batch_shape) != 1 or self.feasible_set.dim != p:
-            actual = (*self.feasible_set.batch_shape, self.feasible_set.dim)
-            raise InputError("feasible_set", f"a batch (B,) of sets over the task's {p} parameters", actual)
+        require_task(self.task)
+        require_prior("feasible_set", self.feasible_set, self.task)
+        require_choice("on_inconsistent", self.on_inconsistent, get_args(OnInconsistent))
+        p = self.feasible_set.dim
         self.model = ObservationModel(self.task, self.barriers, self.kind, self.noise, self.active_tolerance)
         if self.compiled and p != 2:
             raise InputError("compiled", "None or False unless theta is planar", True)
@@ -210,6 +211,20 @@ class SetMembershipObserver:
         if self.on_inconsistent == "raise" and bool(lost.any()):
             robot = int(lost.int().argmax())
             raise InconsistentError(robot, t, contradicting(theta, robot))
+
+
+def require_prior(name: str, prior: Any, task: Task) -> None:
+    """Check the prior of a batch of robots.
+
+    Raises:
+        InputError: it is no batch (B,) of sets over the task's parameters.
+    """
+    p = len(task.parameter_names)
+    expected = f"a FeasibleSet for each robot, a batch (B,) over the task's {p} parameters"
+    if not isinstance(prior, FeasibleSet):
+        raise InputError(name, f"{expected}, e.g. FeasibleSet.from_box(lower, upper) of (B, {p})", repr(prior))
+    if len(prior.batch_shape) != 1 or prior.dim != p:
+        raise InputError(name, expected, f"batch {tuple(prior.batch_shape)} over {prior.dim}")
 
 
 def contradicting(sets: FeasibleSet, item: int) -> tuple[tuple[float, int], ...]:

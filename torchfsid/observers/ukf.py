@@ -39,6 +39,7 @@ from torchfsid.identification.active_set import active_set
 from torchfsid.identification.kkt import solve_kkt
 from torchfsid.observers.motions import Array, Motion, ObservedMotion, QpMotion, Wish
 from torchfsid.outcome import FilterStatus
+from torchfsid.robots.arguments import require_barriers, require_task
 from torchfsid.robots.barriers import Barrier, controller_failed, stack_barriers
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.tasks import Task, feedback_of
@@ -113,6 +114,8 @@ class ParameterUkf:
     filters: list[UnscentedKalmanFilter | None] = field(init=False)
 
     def __post_init__(self) -> None:
+        require_task(self.task)
+        require_barriers(self.barriers)
         p = len(self.task.parameter_names)
         if self.mean.ndim != 2 or self.mean.shape[-1] != p or not bool(self.mean.isfinite().all()):
             raise InputError("mean", f"finite means (B, {p})", self.mean)

@@ -26,6 +26,7 @@ from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.outcome import ProgrammeStatus
 from torchfsid.programmes.differentiable import broadcast, nearest
+from torchfsid.robots.arguments import require_barriers, require_task
 from torchfsid.robots.barriers import Barrier, is_joint, neighbours_controls
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.speed_disc import least_violation, nearest_in_disc
@@ -105,6 +106,8 @@ class CbfQpController:
     barriers: Sequence[Barrier]
 
     def __post_init__(self) -> None:
+        require_task(self.task)
+        require_barriers(self.barriers)
         if len(self.barriers) == 0:
             raise InputError("barriers", "at least one barrier", self.barriers)
         if len(self.barriers) > 1 and any(getattr(barrier, "relaxes", False) for barrier in self.barriers):
