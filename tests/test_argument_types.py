@@ -47,6 +47,7 @@ MISTAKES: dict[str, tuple[Callable[[], object], str]] = {
 }  # fmt: skip
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_refused_where_it_is_made(mistake: str) -> None:
     make, told = MISTAKES[mistake]
