@@ -28,7 +28,7 @@ from torchfsid.halfspaces import Halfspaces
 from torchfsid.identification.by_robot import by_robot
 from torchfsid.identification.evidence import Evidence, ObservationModel, evidence
 from torchfsid.identification.inverse_optimal import per_row
-from torchfsid.outcome import Outcome
+from torchfsid.outcome import Status
 from torchfsid.robots.arguments import require_barriers, require_task
 from torchfsid.robots.avoidance_within import AvoidanceWithin, SafetyRows
 from torchfsid.robots.barriers import Barrier
@@ -243,5 +243,5 @@ def _must_be_active(
         left = (~explained).nonzero().flatten()
         if len(left):
             sets = theta.select(robot[left]).intersect(Halfspaces(omega.A[left], omega.b[left]))
-            must[items[left], rows[left]] = sets.outcome == Outcome.EMPTY
+            must[items[left], rows[left]] = sets.outcome == Status.EMPTY
     return must

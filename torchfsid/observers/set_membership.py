@@ -41,6 +41,9 @@ from torchfsid.tolerances import ACTIVE_TOLERANCE
 
 OnInconsistent = Literal["hold", "reset", "raise"]
 
+MOST_SHOWN = 8
+"""Robots in the text of an estimate."""
+
 
 @dataclass(frozen=True)
 class Event:
@@ -76,6 +79,14 @@ class SetEstimate:
     informative: Bool[Tensor, "B"]
     status: Int[Tensor, "B"]
     safety: FeasibleSet | None = None
+
+    @property
+    def status_names(self) -> list[str]:
+        """The statuses in words, one per robot."""
+        return Status.names(self.status)
+
+    def __repr__(self) -> str:
+        return f"SetEstimate(t={self.t:g}, sets={self.feasible_set!r}, status={Status.names(self.status[:MOST_SHOWN])})"
 
     @property
     def kkt(self) -> KktSolution:
@@ -211,6 +222,11 @@ class SetMembershipObserver:
         if self.on_inconsistent == "raise" and bool(lost.any()):
             robot = int(lost.int().argmax())
             raise InconsistentError(robot, t, contradicting(theta, robot))
+
+
+def rounded(theta: Float[Tensor, "B p"]) -> list[list[float]]:
+    """The first parameters of a batch with four digits, for a line of text."""
+    return [[float(f"{value:.4g}") for value in row] for row in theta[:MOST_SHOWN].tolist()]
 
 
 def require_prior(name: str, prior: Any, task: Task) -> None:

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.outcome import ProgrammeStatus
+from torchfsid.outcome import Status
 from torchfsid.programmes.differentiable import broadcast, nearest
 from torchfsid.robots.arguments import require_barriers, require_task
 from torchfsid.robots.barriers import Barrier, is_joint, neighbours_controls
@@ -63,7 +63,7 @@ def solve_safe_qp(safe_controls: Halfspaces, uhat: Float[Tensor, "*batch n"]) ->
         raise InputError("uhat", f"(*batch, {n})", tuple(uhat.shape))
     rows, y, _ = broadcast(safe_controls, uhat)
     nearest_control, mu, places, filled, status = nearest(rows, y)
-    feasible = status == ProgrammeStatus.OK
+    feasible = status == Status.OK
     u = torch.where(feasible.unsqueeze(-1), nearest_control, 0.0)
     held = torch.where(filled, 2 * mu.clamp(min=0), 0.0)
     multipliers = torch.zeros_like(rows.b).scatter_add(-1, places, held)[..., :m]

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from torchfsid.halfspaces import Halfspaces, array
 from torchfsid.kernels import extent
-from torchfsid.outcome import Outcome, ProgrammeStatus
+from torchfsid.outcome import Status
 from torchfsid.programmes.differentiable import inscribed_ball, nearest_point, times
 from torchfsid.sets import derivatives, sensitivity
 from torchfsid.sets.body import PRIOR, Clipped, Contradiction
@@ -111,7 +111,7 @@ class Polytope:
     ) -> Clipped:
         (B, R, p), F, device = A.shape, self.b.shape[1], self.A.device
         cells, origins, against = list(self._cells), self._origins(), np.full((B, p + 1), -1)
-        outcome, shrunk, rows, right = np.full(B, int(Outcome.NONEMPTY)), np.zeros(B, dtype=bool), array(A), array(b)
+        outcome, shrunk, rows, right = np.full(B, int(Status.OK)), np.zeros(B, dtype=bool), array(A), array(b)
         for i in np.flatnonzero(self._exceeded(rows, right)):
             found = intersect(cells[i], rows[i], right[i])
             # The polytopes' own rows come first among all rows, item by item.
@@ -192,7 +192,7 @@ class Polytope:
         """
         rows = self._recentred
         centre, radius, status = inscribed_ball(rows)
-        flat, lost = radius <= FLAT * self.reach.amax(-1), status == ProgrammeStatus.UNSOLVED
+        flat, lost = radius <= FLAT * self.reach.amax(-1), status == Status.UNSOLVED
         if bool(lost.any()):
             radius = torch.where(lost, rows.slack(torch.zeros_like(centre)).amin(-1).clamp(min=0.0), radius)
         centre = self._middle + torch.where((flat | lost).unsqueeze(-1), 0.0, centre)
@@ -207,7 +207,7 @@ class Polytope:
         """
         rows, point = self._recentred, point - self._middle
         found = nearest_point(rows, point, metric)
-        lost = found.status == ProgrammeStatus.EMPTY
+        lost = found.status == Status.EMPTY
         if bool(lost.any()):  # lost to the round-off of the middle, as in a flat set
             wider = rows.b + torch.where(lost.unsqueeze(-1), 2 * self._round_off, 0.0)
             found = nearest_point(Halfspaces(rows.A, wider), point, metric)
