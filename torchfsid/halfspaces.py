@@ -146,9 +146,10 @@ def as_halfspaces(value: Any) -> Halfspaces:
         return value
     if isinstance(value, tuple | list) and len(value) == 2:
         return Halfspaces(*value)
-    if not callable(getattr(value, "halfspaces", None)):
+    if not hasattr(value, "halfspaces"):
         raise InputError("halfspaces", "Halfspaces, a FeasibleSet or a pair (A, b)", type(value).__name__)
-    return value.halfspaces()
+    rows: Any = value
+    return rows.halfspaces()
 
 
 def dot(v: Float[Tensor, "*#batch n"], w: Float[Tensor, "*#batch n"]) -> Float[Tensor, "*#batch"]:

@@ -13,13 +13,12 @@ from pydantic import Discriminator, Field, Tag, model_validator
 
 from torchfsid.config.avoidance import AvoidanceConfig
 from torchfsid.config.bags import BagConfig
-from torchfsid.config.barriers import BarrierConfig
 from torchfsid.config.bodies import UnicycleConfig
 from torchfsid.config.documents import Strict, wrong
+from torchfsid.config.given import GIVEN, AnyBarrierConfig, AnyPriorConfig, AnyTaskConfig, bounds, is_object
 from torchfsid.config.motion_capture import LogConfig
-from torchfsid.config.observers import AccelerationNoiseConfig, ObservedNoiseConfig, PriorConfig, UkfConfig
+from torchfsid.config.observers import AccelerationNoiseConfig, ObservedNoiseConfig, UkfConfig
 from torchfsid.config.quantities import BodyName, Positive, require_body
-from torchfsid.config.tasks import TaskConfig
 from torchfsid.config.unknown_numbers import UnknownNumber, unknown_numbers
 from torchfsid.errors import ConfigError
 
@@ -84,9 +83,9 @@ class ObserveConfig(Strict):
             `si_to_uni`, since positions then do not follow the commands.
     """
 
-    task: TaskConfig
-    barriers: Annotated[tuple[BarrierConfig, ...], Field(min_length=1)]
-    prior: PriorConfig
+    task: AnyTaskConfig
+    barriers: Annotated[tuple[AnyBarrierConfig, ...], Field(min_length=1)]
+    prior: AnyPriorConfig
     noise: AnyNoiseConfig
     set: Literal["inverse_optimal", "critical_region"] = "inverse_optimal"
     active_tolerance: Positive = 1e-3
@@ -100,6 +99,13 @@ class ObserveConfig(Strict):
     bag: BagConfig | None = None
     log: LogConfig | None = None
     ukf: OptionalUkfConfig = UkfConfig()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _takes_bounds(cls, data: Any) -> Any:
+        if not isinstance(data, Mapping) or not is_object(data.get("noise")):
+            return data
+        return {**data, "noise": bounds(data["noise"], data.get("dynamics"))}
 
     @model_validator(mode="after")
     def _fits_together(self) -> ObserveConfig:
@@ -268,17 +274,19 @@ class ObserveConfig(Strict):
 
 
 def require_one_order(
-    dynamics: Dynamics, task: TaskConfig, barriers: Sequence[BarrierConfig], noise: AnyNoiseConfig
+    dynamics: Dynamics, task: AnyTaskConfig, barriers: Sequence[AnyBarrierConfig], noise: AnyNoiseConfig
 ) -> None:
     """Check, in a validator, that task, barriers and noise are those of robots with these dynamics."""
     second, declared = dynamics == "double_integrator", f"dynamics: {dynamics}"
-    if second and task.kind != "goal":
+    if second and task.kind not in ("goal", GIVEN):
         raise wrong(f"expected 'goal' with {declared}, got {task.kind!r}", "task.kind")
     if second and getattr(task, "law", "proportional") != "proportional":
         raise wrong(f"expected 'proportional' with {declared}", "task.law")
     if not second and task.needs_velocity is not None:
         raise wrong("needs dynamics: double_integrator", f"task.{task.needs_velocity}")
     for i, barrier in enumerate(barriers):
+        if barrier.kind == GIVEN:  # its controls are what they are
+            continue
         if barrier.kind == "avoidance" and barrier.is_second_order != second:
             raise wrong(f"expected {1 + second} with {declared}, got {2 - second}", f"barriers[{i}].order")
         if barrier.is_second_order != second:

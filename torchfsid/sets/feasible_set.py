@@ -43,7 +43,8 @@ MAX_FACETS = 32
 class FeasibleSet:
     """A batch of bounded convex sets of parameters. Build it with `from_box`, shrink it with `intersect`.
 
-    `sets[0]` and `sets[1:3]` are parts of the batch, len(sets) its length. The shape of a batch is free, but
+    `sets[0]` and `sets[1:3]` are parts of the batch, `one[None]` is a batch of one set, len(sets) is the length of a
+    batch. The shape of a batch is free, but
     `torch.func.vmap` does not run over sets: searches look at the numbers. The layers of `programmes` take them, too.
 
     Attributes:
