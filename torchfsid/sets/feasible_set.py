@@ -43,9 +43,8 @@ MAX_FACETS = 32
 class FeasibleSet:
     """A batch of bounded convex sets of parameters. Build it with `from_box`, shrink it with `intersect`.
 
-    `sets[0]` and `sets[1:3]` are parts of the batch, `one[None]` is a batch of one set, len(sets) is the length of a
-    batch. The shape of a batch is free, but
-    `torch.func.vmap` does not run over sets: searches look at the numbers. The layers of `programmes` take them, too.
+    `sets[0]` and `sets[1:3]` are parts of a batch, `one[None]` is a batch of one. Its shape is free, but
+    `torch.func.vmap` does not run over sets: searches look at the numbers. The layers of `programmes` take sets, too.
 
     Attributes:
         body: the sets with the batch flattened, a `Polygon` in the plane and a `Polytope` in other dimensions.
