@@ -28,7 +28,7 @@ def run() -> fsid.Trajectory:
     """Two robots swap places past a pillar."""
     start = torch.tensor([[-2.0, 0.0], [2.0, 0.3]], dtype=torch.float64)
     controller = fsid.CbfQpController(TASK, [AVOIDANCE])
-    return fsid.simulate(controller, GOALS, start, dt=0.05, steps=60, obstacles=torch.tensor([[0.2, 1.0]]))
+    return fsid.simulate(controller, GOALS, start, dt=0.05, steps=40, obstacles=torch.tensor([[0.2, 1.0]]))
 
 
 @pytest.fixture(scope="module")
@@ -118,6 +118,9 @@ def test_the_course_of_a_result_and_its_files(
         found.over_time("area")
     assert "\n" not in repr(found)
     assert len(repr(found)) < 200
+    assert found.plot(tmp_path / "figure.pdf").is_file()
+    with pytest.raises(fsid.InputError, match=r"\*\.pdf"):
+        found.plot(tmp_path / "figure.svg")
     folder = found.save(tmp_path / "out")
     assert {"estimates.csv", "regions.json", "config.yaml", "regions.png"} <= {path.name for path in folder.iterdir()}
     found.save(folder)  # its own results are replaced

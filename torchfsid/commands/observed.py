@@ -21,7 +21,7 @@ from torch import Tensor
 
 from torchfsid.commands.figures import draw_observation
 from torchfsid.commands.observe import Observation, Verdict
-from torchfsid.commands.results_folder import OBSERVE, ResultsFolder, write_json
+from torchfsid.commands.results_folder import OBSERVE, ResultsFolder, write_json, write_whole
 from torchfsid.config.documents import dump
 from torchfsid.errors import InputError
 from torchfsid.logs.log import Log
@@ -30,6 +30,8 @@ from torchfsid.sets.feasible_set import FeasibleSet
 
 TEXTS = ("robot", "case", "status")
 """Columns of estimates.csv that are no numbers."""
+
+CONFIG = "config.yaml"
 
 MOST_SHOWN = 8
 """Robots in the text of a result."""
@@ -48,6 +50,7 @@ class Observed:
 
     def __init__(self, observation: Observation):
         self.observation, self._folder = observation, TemporaryDirectory(prefix="torchfsid-")
+        write_whole(self._out / CONFIG, dump(observation.stated))
         observation.run(self._out)
         if observation.narrowing is not None:
             write_json(self._out / "unknown_numbers.json", observation.narrowing.to_json())
@@ -124,18 +127,36 @@ class Observed:
             return torch.from_numpy(self.estimates[name]).reshape(shape)
         return torch.stack([torch.from_numpy(self.estimates[part]).reshape(shape) for part in parts], dim=-1)
 
-    def plot(self) -> Path:
+    def plot(self, path: str | Path | None = None) -> Path:
         """Draw the sets over the paths, their sizes and the cases over time.
 
-        Returns:
-            The path of the figure, regions.png, with regions.pdf beside it. They live as long as this result; `save`
-            copies them.
+        Args:
+            path: a file *.png or *.pdf. None: a PNG that lives as long as this result, to be shown in a notebook by
+                `IPython.display.Image(result.plot())`.
 
         Raises:
+            InputError: the suffix is another one.
             FigureError: it cannot be drawn.
+            OSError: the file cannot be written.
         """
-        figure, _ = draw_observation(self._out, self.log.x, self.log.seen, self.log.bodies)
-        return figure
+        drawn = draw_observation(self._out, self.log.x, self.log.seen, self.log.bodies)
+        of_suffix = {figure.suffix: figure for figure in drawn}
+        if path is None:
+            return of_suffix[".png"]
+        if Path(path).suffix not in of_suffix:
+            raise InputError("path", "a file *.png or *.pdf", str(path))
+        return Path(shutil.copyfile(of_suffix[Path(path).suffix], path))
+
+    def report(self, path: str | Path = "report.html") -> Path:
+        """Write the run as one HTML page that opens offline, see `torchfsid report`.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        from torchfsid.commands.page.report import PAGE, write_pages
+
+        write_pages(self._out)
+        return Path(shutil.copyfile(self._out / PAGE, path))
 
     def save(self, folder: str | Path) -> Path:
         """Write the files of `torchfsid observe` into a folder, which is made, or holds such results already.
@@ -146,7 +167,7 @@ class Observed:
             OSError: a file cannot be written.
         """
         self.plot()
-        files = sorted(path.name for path in self._out.iterdir())
+        files = sorted(path.name for path in self._out.iterdir() if path.name != CONFIG)
         results = ResultsFolder(Path(folder), OBSERVE)
         try:
             results.claim(files, dump(self.observation.stated))

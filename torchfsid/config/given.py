@@ -87,6 +87,7 @@ class GivenBarrier(_Given):
 
     kind: Literal["python"] = GIVEN
     narrowed: ClassVar[Units] = {}
+    suspects: ClassVar[tuple[str, ...]] = ("object",)
 
     @model_validator(mode="after")
     def _is_a_barrier(self) -> GivenBarrier:
