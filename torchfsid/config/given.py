@@ -48,9 +48,15 @@ def _wrapped(value: Any) -> Any:
 
 
 class _Given(Strict):
-    """An object. Its text stands in for it in a file."""
+    """An object. Its text stands in for it in a file.
+
+    Attributes:
+        object: the object.
+        suspects: the key to look at where it contradicts a log.
+    """
 
     object: Any
+    suspects: ClassVar[tuple[str, ...]] = ("object",)
 
     @field_serializer("object")
     def _as_text(self, value: Any) -> str:
@@ -87,7 +93,6 @@ class GivenBarrier(_Given):
 
     kind: Literal["python"] = GIVEN
     narrowed: ClassVar[Units] = {}
-    suspects: ClassVar[tuple[str, ...]] = ("object",)
 
     @model_validator(mode="after")
     def _is_a_barrier(self) -> GivenBarrier:
