@@ -153,7 +153,8 @@ class Observed:
         Raises:
             OSError: the file cannot be written.
         """
-        from torchfsid.commands.page.report import PAGE, write_pages
+        from torchfsid.commands.page.report import write_pages
+        from torchfsid.commands.page.write import PAGE
 
         write_pages(self._out)
         return Path(shutil.copyfile(self._out / PAGE, path))

@@ -57,8 +57,8 @@ class Strict(BaseModel):
 Config = TypeVar("Config", bound=Strict)
 
 CHOICES = frozenset(
-    {"<section>", "<false>", "<number>", "<interval>", "<velocity>", "<acceleration>", "<object>"}
-    | {"<name>", "<columns>", "avoidance, order: 2"}
+    {"<section>", "<false>", "<number>", "<interval>", "<velocity>", "<acceleration>", "avoidance, order: 2"}
+    | {"<name>", "<columns>"}
 )
 """Tags of values of two kinds, a section or False, a number or an interval. Pydantic puts them into paths, but they are
 no keys."""
@@ -171,9 +171,7 @@ def _path(error: ErrorDetails, mapping: Mapping[Any, Any]) -> str:
     node: Any = mapping
     kind = None
     for part in error["loc"]:
-        if part in CHOICES:  # the tag of a choice may stand before the kind
-            continue
-        if kind is not None and part == kind:
+        if (kind is not None and part == kind) or part in CHOICES:
             kind = None
             continue
         keys.append(part)

@@ -7,19 +7,16 @@ what the commands ask a section. Files cannot hold objects: config.yaml shows an
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import date
 from textwrap import shorten
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from pydantic import BeforeValidator, Discriminator, Tag, field_serializer, model_validator
-from pydantic.json_schema import SkipJsonSchema
+from pydantic import field_serializer
 
-from torchfsid.config.barriers import BarrierConfig
 from torchfsid.config.documents import Strict, wrong
-from torchfsid.config.observers import PriorConfig
 from torchfsid.config.quantities import Units
-from torchfsid.config.tasks import TaskConfig, _Task
+from torchfsid.config.tasks import _Task
 from torchfsid.errors import ConfigError, InputError, one_line
 
 if TYPE_CHECKING:
@@ -28,23 +25,15 @@ if TYPE_CHECKING:
 
     from torchfsid.sets.feasible_set import FeasibleSet
 
+Handler = Callable[[Any], Any]
+
 GIVEN = "python"
 """The kind of a section that is an object."""
-
-OBJECT, SECTION = "<object>", "<section>"
 
 
 def is_object(value: Any) -> bool:
     """Is this neither a section nor anything else that a file can hold?"""
     return value is not None and not isinstance(value, Strict | Mapping | str | int | float | list | tuple | date)
-
-
-def _tag(value: Any) -> str:
-    return OBJECT if is_object(value) or isinstance(value, GivenTask | GivenBarrier | GivenPrior) else SECTION
-
-
-def _wrapped(value: Any) -> Any:
-    return {"object": value} if is_object(value) else value
 
 
 class _Given(Strict):
@@ -68,13 +57,6 @@ class GivenTask(_Given, _Task):
 
     kind: Literal["python"] = GIVEN
 
-    @model_validator(mode="after")
-    def _is_a_task(self) -> GivenTask:
-        from torchfsid.robots.arguments import require_task
-
-        _refused_as_section(require_task, self.object)
-        return self
-
     @property
     def parameters(self) -> int:
         return len(self.object.parameter_names)
@@ -93,13 +75,6 @@ class GivenBarrier(_Given):
 
     kind: Literal["python"] = GIVEN
     narrowed: ClassVar[Units] = {}
-
-    @model_validator(mode="after")
-    def _is_a_barrier(self) -> GivenBarrier:
-        from torchfsid.robots.arguments import require_barriers
-
-        _refused_as_section(lambda barrier: require_barriers([barrier]), self.object)
-        return self
 
     @property
     def is_unknown(self) -> bool:
@@ -142,14 +117,6 @@ class GivenPrior(_Given):
 
     kind: Literal["python"] = GIVEN
 
-    @model_validator(mode="after")
-    def _is_a_set(self) -> GivenPrior:
-        from torchfsid.sets.feasible_set import FeasibleSet
-
-        if not isinstance(self.object, FeasibleSet) or len(self.object.batch_shape) > 1 or self.object.any_empty:
-            raise wrong(f"expected {{lower: [..], upper: [..]}} or a FeasibleSet, got {reprlib.repr(self.object)}")
-        return self
-
     @property
     def lower(self) -> tuple[float, ...]:
         """The least entries of theta in all sets."""
@@ -180,7 +147,38 @@ class GivenPrior(_Given):
         return vertices.amin(-2), vertices.amax(-2)
 
 
-def _refused_as_section(check: Any, value: Any) -> None:
+def a_task(value: Any, section: Handler) -> Any:
+    """A section of a task, or a task, as a section."""
+    if is_object(value):
+        from torchfsid.robots.arguments import require_task
+
+        _check(require_task, value)
+        return GivenTask(object=value)
+    return value if isinstance(value, GivenTask) else section(value)
+
+
+def a_barrier(value: Any, section: Handler) -> Any:
+    """A section of a barrier, or a barrier, as a section."""
+    if is_object(value):
+        from torchfsid.robots.arguments import require_barriers
+
+        _check(lambda barrier: require_barriers([barrier]), value)
+        return GivenBarrier(object=value)
+    return value if isinstance(value, GivenBarrier) else section(value)
+
+
+def a_prior(value: Any, section: Handler) -> Any:
+    """A section of a prior, or a `FeasibleSet`, as a section."""
+    if is_object(value):
+        from torchfsid.sets.feasible_set import FeasibleSet
+
+        if not isinstance(value, FeasibleSet) or len(value.batch_shape) > 1 or value.any_empty:
+            raise wrong(f"expected {{lower: [..], upper: [..]}} or a FeasibleSet, got {reprlib.repr(value)}")
+        return GivenPrior(object=value)
+    return value if isinstance(value, GivenPrior) else section(value)
+
+
+def _check(check: Handler, value: Any) -> None:
     """Turn the refusal of an argument into that of a section."""
     try:
         check(value)
@@ -208,20 +206,3 @@ def bounds(noise: Any, dynamics: Any) -> dict[str, Any]:
         return {"velocity": given["velocity"], **slack, **others}
     second = {"acceleration": given["velocity"], "velocity": given["arrival"]}
     return {**second, **slack, **others, "neighbour_acceleration": given["neighbour_acceleration"]}
-
-
-AnyTaskConfig = Annotated[
-    Annotated[TaskConfig, Tag(SECTION)] | Annotated[SkipJsonSchema[GivenTask], BeforeValidator(_wrapped), Tag(OBJECT)],
-    Discriminator(_tag),
-]
-AnyBarrierConfig = Annotated[
-    Annotated[BarrierConfig, Tag(SECTION)]
-    | Annotated[SkipJsonSchema[GivenBarrier], BeforeValidator(_wrapped), Tag(OBJECT)],
-    Discriminator(_tag),
-]
-AnyPriorConfig = Annotated[
-    Annotated[PriorConfig, Tag(SECTION)]
-    | Annotated[SkipJsonSchema[GivenPrior], BeforeValidator(_wrapped), Tag(OBJECT)],
-    Discriminator(_tag),
-]
-"""A section of a file, or an object in Python. The schema of files does not show the object."""
