@@ -121,6 +121,7 @@ def test_the_course_of_a_result_and_its_files(
     assert found.plot(tmp_path / "figure.pdf").is_file()
     with pytest.raises(fsid.InputError, match=r"\*\.pdf"):
         found.plot(tmp_path / "figure.svg")
+    assert "<html" in found.report(tmp_path / "run.html").read_text(encoding="utf-8")
     folder = found.save(tmp_path / "out")
     assert {"estimates.csv", "regions.json", "config.yaml", "regions.png"} <= {path.name for path in folder.iterdir()}
     found.save(folder)  # its own results are replaced
