@@ -1,4 +1,4 @@
-"""python -m benchmarks {geometry, polyhedra, layers, fleet, observer, gradients, safety, orca, threads} [its options]"""
+"""python -m benchmarks {geometry, polyhedra, layers, fleet, observer, gradients, safety, orca, threads} [options]"""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfsid.outcome import Outcome
+from torchfsid.outcome import Status
 from torchfsid.sets.body import Clipped
 from torchfsid.sets.polyhedron import Polyhedron
 from torchfsid.sets.polytope import Polytope
@@ -67,7 +67,7 @@ def random_set(
         b[:2] = A[:2] @ truth + width / 2 * np.linalg.norm(A[:2], axis=1)
     before = box(p)
     after = cut(before, A, b)
-    assert after.outcome == Outcome.NONEMPTY
+    assert after.outcome == Status.OK
     sides, ends = rows_of(before)
     return after.body, np.vstack([A, sides]), np.append(b, ends)
 

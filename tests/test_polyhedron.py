@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull
 
 from tests.polytopes import BOX, box, cut, exact_vertices, points_of, rows_of, tensor
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.outcome import Outcome
+from torchfsid.outcome import Status
 from torchfsid.sets.feasible_set import FeasibleSet
 from torchfsid.sets.polyhedron import Polyhedron
 from torchfsid.sets.polytope import Polytope
@@ -78,7 +78,7 @@ def test_adversarial_rows_against_exact_rationals(kind: str, most: int) -> None:
             rows, right = adversarial(rng, kind, body, truth, step)
             A, b = np.vstack([A, rows]), np.append(b, right)
             body = body.clip(*(tensor(part)[None] for part in (rows, right, 0 * right)), torch.zeros(1, 6).long(), most)
-            assert body.outcome != Outcome.EMPTY
+            assert body.outcome != Status.EMPTY
             body = body.body
             check_graph(body)
             for row, c in zip(*rows_of(body), strict=True):
@@ -108,7 +108,7 @@ def test_thin_sets_have_the_volume_of_exact_rationals(width: float) -> None:
             slack = np.append(width * rng.uniform(0.25, 0.5, 2), rng.uniform(1, 4, 4))
             right = rows @ truth + slack * np.linalg.norm(rows, axis=1)
             after = cut(body, rows, right)
-            assert after.outcome == Outcome.NONEMPTY
+            assert after.outcome == Status.OK
             body, A, b = after.body, np.vstack([A, rows]), np.append(b, right)
         exact = exact_vertices(A, b)
         y = np.array([[float(x - x0) for x, x0 in zip(z, exact[0], strict=True)] for z in exact])
@@ -147,10 +147,10 @@ def test_many_facets_through_one_vertex() -> None:
     assert pyramid.volume().item() == pytest.approx(16 * math.tan(math.pi / 16) / 3, rel=1e-12)
     above = np.array([[0.1, 0.05, -1.0]])
     beyond = cut(pyramid, above, np.array([-1.0 - 1e-9]))
-    assert beyond.outcome == Outcome.EMPTY
+    assert beyond.outcome == Status.EMPTY
     assert (~beyond.contradiction.b[0].isnan()).sum() <= 4
     touched = cut(pyramid, above, np.array([-1.0]))
-    assert touched.outcome == Outcome.UNDECIDED
+    assert touched.outcome == Status.UNDECIDED
     assert touched.body.volume() == 0
     assert touched.body.centroid()[0].numpy() == pytest.approx([0, 0, 1], abs=1e-13)
     cut_off = cut(pyramid, np.array([[0, 0, 1.0]]), np.array([0.5])).body

@@ -23,7 +23,7 @@ from tests.polytopes import (
     rows_of,
     tensor,
 )
-from torchfsid.outcome import Outcome
+from torchfsid.outcome import Status
 from torchfsid.sets.body import PRIOR
 
 # Volumes that are known, and volumes that must add up -----------------------------------------------------------------
@@ -92,7 +92,7 @@ def test_rows_parallel_to_almost_round_off(p: int) -> None:
             rows = np.vstack([own[again] * scale * tilt, new])
             right = np.maximum(np.append(ends[again] * scale[:, 0], slack), rows @ truth)
             after = cut(body, rows, right)
-            assert after.outcome != Outcome.EMPTY
+            assert after.outcome != Status.EMPTY
             assert after.body.volume() <= body.volume() * (1 + 1e-6)
             body, A, b = after.body, np.vstack([A, rows]), np.append(b, right)
         # Joggled: merging coplanar facets, Qhull's default, is wrong by per cents in four dimensions.

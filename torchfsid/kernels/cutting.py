@@ -29,10 +29,10 @@ import numpy as np
 from torchfsid.kernels.compiled import item, item_of_ordered, launcher
 from torchfsid.kernels.linear import solve_rows
 from torchfsid.kernels.simple_polyhedron import take_out
-from torchfsid.outcome import Outcome
+from torchfsid.outcome import Status
 from torchfsid.tolerances import ROUND_OFF
 
-NONEMPTY, UNDECIDED, EMPTY = int(Outcome.NONEMPTY), int(Outcome.UNDECIDED), int(Outcome.EMPTY)
+NONEMPTY, UNDECIDED, EMPTY = int(Status.OK), int(Status.UNDECIDED), int(Status.EMPTY)
 
 INSIDE, BEYOND, DROPPED, KEPT = 0, 1, 2, 3
 

@@ -26,9 +26,9 @@ from torch import Tensor
 
 from torchfsid.errors import InputError, SolverError
 from torchfsid.observers.safety import SafetyObserver, SetObserver
-from torchfsid.observers.set_membership import SetEstimate
+from torchfsid.observers.set_membership import SetEstimate, rounded
 from torchfsid.observers.ukf import ParameterUkf, UkfEstimate
-from torchfsid.outcome import HybridStatus
+from torchfsid.outcome import Status
 from torchfsid.robots.measurement import Measurement
 from torchfsid.sets.feasible_set import FeasibleSet
 
@@ -45,7 +45,7 @@ class HybridEstimate:
         theta: the filter's estimate projected onto Theta(t).
         set_estimate: the estimate of the set-membership observer.
         ukf_estimate: the estimate of the filter, with feedback after its mean was replaced.
-        status: a `HybridStatus` per robot.
+        status: a `Status` per robot.
     """
 
     t: float
@@ -53,6 +53,14 @@ class HybridEstimate:
     set_estimate: SetEstimate
     ukf_estimate: UkfEstimate
     status: Int[Tensor, "B"]
+
+    @property
+    def status_names(self) -> list[str]:
+        """The statuses in words, one per robot."""
+        return Status.names(self.status)
+
+    def __repr__(self) -> str:
+        return f"HybridEstimate(t={self.t:g}, theta={rounded(self.theta)}, {self.set_estimate!r})"
 
 
 @dataclass
@@ -94,7 +102,7 @@ class HybridObserver:
 
 
 def _into(sets: FeasibleSet, estimate: UkfEstimate) -> tuple[Float[Tensor, "B p"], Int[Tensor, "B"]]:
-    """The filter's estimates projected onto the sets, and a `HybridStatus` for each robot."""
+    """The filter's estimates projected onto the sets, and a `Status` for each robot."""
     metric, usable = _information_metric(estimate.covariance)
     known = estimate.theta.isfinite().all(-1)
     start = torch.where(known.unsqueeze(-1), estimate.theta, 0.0)
@@ -102,11 +110,11 @@ def _into(sets: FeasibleSet, estimate: UkfEstimate) -> tuple[Float[Tensor, "B p"
         theta = sets.project(start, metric)
     except SolverError:
         theta = torch.full_like(start, torch.nan)
-    status = torch.where(usable, HybridStatus.OK, HybridStatus.EUCLIDEAN)
+    status = torch.where(usable, Status.OK, Status.EUCLIDEAN)
     found = known & theta.isfinite().all(-1) & sets.contains(theta)
     if not bool(found.all()):
         theta = torch.where(found.unsqueeze(-1), theta, sets.centroid())
-        status = torch.where(found, status, HybridStatus.CENTROID)
+        status = torch.where(found, status, Status.CENTROID)
     return theta, status
 
 

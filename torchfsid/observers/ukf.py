@@ -38,7 +38,8 @@ from torchfsid.halfspaces import Halfspaces
 from torchfsid.identification.active_set import active_set
 from torchfsid.identification.kkt import solve_kkt
 from torchfsid.observers.motions import Array, Motion, ObservedMotion, QpMotion, Wish
-from torchfsid.outcome import FilterStatus
+from torchfsid.outcome import Status
+from torchfsid.robots.arguments import require_barriers, require_task
 from torchfsid.robots.barriers import Barrier, controller_failed, stack_barriers
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.tasks import Task, feedback_of
@@ -68,13 +69,18 @@ class UkfEstimate:
         t: time [s].
         theta: the mean of theta.
         covariance: the covariance of theta.
-        status: a `FilterStatus` per robot, for this measurement alone.
+        status: a `Status` per robot, for this measurement alone.
     """
 
     t: float
     theta: Float[Tensor, "B p"]
     covariance: Float[Tensor, "B p p"]
     status: Int[Tensor, "B"]
+
+    @property
+    def status_names(self) -> list[str]:
+        """The statuses in words, one per robot."""
+        return Status.names(self.status)
 
 
 @dataclass
@@ -113,6 +119,8 @@ class ParameterUkf:
     filters: list[UnscentedKalmanFilter | None] = field(init=False)
 
     def __post_init__(self) -> None:
+        require_task(self.task)
+        require_barriers(self.barriers)
         p = len(self.task.parameter_names)
         if self.mean.ndim != 2 or self.mean.shape[-1] != p or not bool(self.mean.isfinite().all()):
             raise InputError("mean", f"finite means (B, {p})", self.mean)
@@ -234,7 +242,7 @@ class ParameterUkf:
             moving = [ObservedMotion(*of_robot) for of_robot in items]
         return [motion if readable else None for motion, readable in zip(moving, known.tolist(), strict=True)]
 
-    def _update_robot(self, i: int, dt: float, position: Array | None) -> FilterStatus:
+    def _update_robot(self, i: int, dt: float, position: Array | None) -> Status:
         """Bring robot i's filter, mean and covariance to the time of the measurement."""
         kalman, motion = self.filters[i], self._motions[i]
         drift = np.maximum(self.process_noise**2 * dt, (FLOOR * self._scale[i]) ** 2)
@@ -253,18 +261,18 @@ class ParameterUkf:
                 if not (np.isfinite(kalman.x).all() and np.isfinite(kalman.P).all()):
                     return self._restart(i, position)
                 self._theta[i], self._covariance[i] = kalman.x[n:], kalman.P[n:, n:]
-                return FilterStatus.REPAIRED if repaired else FilterStatus.OK
+                return Status.REPAIRED if repaired else Status.OK
         if dt > 0:
             self._covariance[i] += np.diag(drift)
         self.filters[i] = None if position is None else self._start(i, position)
-        return FilterStatus.PREDICTED
+        return Status.PREDICTED
 
-    def _restart(self, i: int, position: Array) -> FilterStatus:
+    def _restart(self, i: int, position: Array) -> Status:
         """Start robot i's filter again from its prior."""
         mean, covariance = self._prior
         self._theta[i], self._covariance[i] = mean[i], covariance[i]
         self.filters[i] = self._start(i, position)
-        return FilterStatus.FAILED
+        return Status.FAILED
 
     def _start(self, i: int, position: Array) -> UnscentedKalmanFilter:
         """A filter at a first measured position, with the current mean and covariance of theta."""

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from torchfsid.halfspaces import array
 from torchfsid.kernels import extent
-from torchfsid.outcome import Outcome
+from torchfsid.outcome import Status
 from torchfsid.sets import derivatives, recentred, sensitivity
 from torchfsid.sets.body import PRIOR, Clipped, Contradiction
 from torchfsid.sets.cell import Cell, intersect, merged
@@ -110,7 +110,7 @@ class Polytope:
     ) -> Clipped:
         (B, R, p), F, device = A.shape, self.b.shape[1], self.A.device
         cells, origins, against = list(self._cells), self._origins(), np.full((B, p + 1), -1)
-        outcome, shrunk, rows, right = np.full(B, int(Outcome.NONEMPTY)), np.zeros(B, dtype=bool), array(A), array(b)
+        outcome, shrunk, rows, right = np.full(B, int(Status.OK)), np.zeros(B, dtype=bool), array(A), array(b)
         for i in np.flatnonzero(self._exceeded(rows, right)):
             found = intersect(cells[i], rows[i], right[i])
             # The polytopes' own rows come first among all rows, item by item.

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.outcome import ProgrammeStatus
+from torchfsid.outcome import Status
 from torchfsid.programmes.differentiable import inscribed_ball, nearest_point, times
 from torchfsid.tolerances import FLAT, ROUND_OFF
 
@@ -33,7 +33,7 @@ def chebyshev(
     """
     rows = Halfspaces(A, b - times(A, middle))
     centre, radius, status = inscribed_ball(rows)
-    flat, lost = radius <= FLAT * reach.amax(-1), status == ProgrammeStatus.UNSOLVED
+    flat, lost = radius <= FLAT * reach.amax(-1), status == Status.UNSOLVED
     if bool(lost.any()):
         radius = torch.where(lost, rows.slack(torch.zeros_like(centre)).amin(-1).clamp(min=0.0), radius)
     centre = middle + torch.where((flat | lost).unsqueeze(-1), 0.0, centre)
@@ -55,7 +55,7 @@ def nearest(
     """
     rows, point = Halfspaces(A, b - times(A, middle)), point - middle
     found = nearest_point(rows, point, metric)
-    lost = found.status == ProgrammeStatus.EMPTY
+    lost = found.status == Status.EMPTY
     if bool(lost.any()):  # lost to the round-off of the middle, as in a flat set
         round_off = ROUND_OFF * (times(A.detach().abs(), reach) + b.detach().abs())
         wider = rows.b + torch.where(lost.unsqueeze(-1), 2 * round_off, 0.0)
