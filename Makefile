@@ -1,5 +1,6 @@
 # make demo    one experiment of the paper, with its figures       make test    every check and every test
 # make lint    the static checks alone                             make clean   removes what the others made
+# make dist    wheel and sdist in dist/, tried in a clean environment outside the checkout
 #
 # Each target does its own set-up: a virtual environment in .venv, pinned by constraints.txt. It needs Python >= 3.11.
 # PyTorch: pip takes its default build, which on Linux brings CUDA libraries (some GB). They are not needed: for the
@@ -18,7 +19,7 @@ DEMO_OUT := results/two_pairs
 # Small tensors: with two threads torch is 7 to 20 times slower than with one.
 export OMP_NUM_THREADS := 1
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint dist clean
 
 demo: $(STAMP)
 	$(BIN)/python -m experiments run $(DEMO) --out $(DEMO_OUT)
@@ -33,6 +34,12 @@ lint: $(STAMP)
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/pyright
 
+# The wheel is built from the sdist, so both are tried.
+dist: $(STAMP)
+	rm -rf dist
+	PIP_CONSTRAINT=$(CURDIR)/constraints.txt $(BIN)/python -m build
+	$(BIN)/python tests/try_wheel.py dist/*.whl constraints.txt
+
 .venv: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt
@@ -45,4 +52,4 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $@
 
 clean:
-	rm -rf .venv results .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf .venv dist results .pytest_cache .ruff_cache .import_linter_cache .hypothesis

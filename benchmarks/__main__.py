@@ -1,4 +1,4 @@
-"""python -m benchmarks {geometry, layers, fleet, observer, gradients, safety, orca, threads} [its options]"""
+"""python -m benchmarks {geometry, polyhedra, layers, fleet, observer, gradients, safety, orca, threads} [options]"""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 import sys
 from importlib import import_module
 
-NAMES = ("geometry", "layers", "fleet", "observer", "gradients", "safety", "orca", "threads")
+NAMES = ("geometry", "polyhedra", "layers", "fleet", "observer", "gradients", "safety", "orca", "threads")
 
 
 def main(arguments: list[str]) -> int:

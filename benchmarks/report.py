@@ -57,6 +57,31 @@ def geometry(found: dict[str, Any]) -> str:
     return "\n".join(parts)
 
 
+def polyhedra(found: dict[str, Any]) -> str:
+    parts = [
+        "## polyhedra: sets of three parameters\n",
+        "[-10, 10]³ and updates of 12 half-spaces: intersect, drop redundant rows, merge to 32 facets; then volume,",
+        f"centroid, diameter. Batches of {found['batch']} sets and one set alone; CPU time per set and update.",
+        "`polytope` is the path in numpy for any dimension, which sets of three parameters took before. Qhull is asked",
+        "about the Chebyshev centre of HiGHS. Failed: as in geometry, against exact rationals.\n",
+    ]
+    for name, rows in found["workloads"].items():
+        parts.append(f"**{name if name == 'ordinary' else 'thin, width ' + name}**\n")
+        body = []
+        for who in ("batch", "batch, polytope"):
+            what = rows[who]
+            rate = f"{1e6 / what['clip']:.0f}"
+            body.append([who, number(what["clip"]), rate, number(what["update"]), f"{what['truths_lost']} truths lost"])
+        for who in ("polyhedron", "polytope", "Qhull"):
+            what = rows[who]
+            body.append([f"one set, {who}", "", "", number(what["microseconds"]), f"{what['failed']} of {what['of']}"])
+        parts.append(table(["", "clip, µs", "clips/s", "with measures, µs", "failed"], body))
+    body = [[who, number(what["median"]), number(what["mean"])] for who, what in found["unknown gain"].items()]
+    parts.append("One robot in the plane with an unknown gain, an update of its observer (all of it):\n")
+    parts.append(table(["", "median, µs", "mean, µs"], body))
+    return "\n".join(parts)
+
+
 def fleet(found: dict[str, Any]) -> str:
     parts = [
         "## fleet: the whole observer update\n",
@@ -178,6 +203,7 @@ def page() -> str:
     parts = [HEAD]
     for name, part in (
         ("geometry", geometry),
+        ("polyhedra", polyhedra),
         ("fleet", fleet),
         ("observer", observer),
         ("layers", layers),

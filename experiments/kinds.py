@@ -47,6 +47,7 @@ class Kind:
         run: (config, folder, track) -> summary. Writes all results but the summary and the figures into the folder.
         show: (summary, console) -> None. Prints the summary.
         draw: (folder, config) -> pairs of a name and a figure or film, drawn from the files of the folder.
+        page: (folder, config) -> report.html as text, from the same files. None: there is no page of this kind.
     """
 
     command: Command
@@ -54,6 +55,7 @@ class Kind:
     run: Later
     show: Later
     draw: Later
+    page: Later | None = None
 
 
 KINDS = {
@@ -63,6 +65,7 @@ KINDS = {
         Later("runs.scene", "run_scene"),
         Later("runs.verdict", "print_verdict"),
         Later("figures.scene", "draw_scene"),
+        Later("pages", "scene_page"),
     ),
     "cases": Kind(
         "run",
@@ -70,6 +73,7 @@ KINDS = {
         Later("runs.cases", "run_cases"),
         Later("runs.table", "print_cases"),
         Later("figures.cases", "draw_cases"),
+        Later("pages", "cases_page"),
     ),
     "swarm": Kind(
         "run",
@@ -84,6 +88,7 @@ KINDS = {
         Later("sweeps.sweep", "run_sweep"),
         Later("sweeps.summary", "print_sweep"),
         Later("figures.sweep", "draw_sweep"),
+        Later("pages", "sweep_page"),
     ),
     "probe_placement": Kind(
         "design",

@@ -105,9 +105,13 @@ FIGURES = ("figure.png", "figure.pdf", "comparison.png", "comparison.pdf", "anim
 """What is drawn. (The figures of a sweep over two lines are called figure_LABEL; a sweep is only ever gone on with.)"""
 
 
+PAGE = "report.html"
+"""The page of a run or a sweep, which is written when it is asked for."""
+
+
 def names(kind: str) -> list[str]:
-    """The names of the files and figures of a kind."""
-    return [*(file.name for file in FILES[kind]), *FIGURES]
+    """The names of the files, figures and pages of a kind."""
+    return [*(file.name for file in FILES[kind]), *FIGURES, PAGE]
 
 
 def require(folder: Path, kind: str) -> None:

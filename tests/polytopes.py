@@ -8,9 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfsid.outcome import Outcome
+from torchfsid.outcome import Status
 from torchfsid.sets.body import Clipped
+from torchfsid.sets.polyhedron import Polyhedron
 from torchfsid.sets.polytope import Polytope
+
+Solid = Polyhedron | Polytope
 
 BOX = 10.0
 """Half the side of the boxes that the sets begin with: the size their round-off is measured against."""
@@ -22,11 +25,15 @@ def tensor(values: object) -> Tensor:
     return torch.as_tensor(np.asarray(values, dtype=float))
 
 
-def box(p: int, half: float = BOX, count: int = 1) -> Polytope:
-    return Polytope.from_box(tensor(np.full((count, p), -half)), tensor(np.full((count, p), half)))
+def kind_for(p: int) -> type[Polyhedron] | type[Polytope]:
+    return Polyhedron if p == 3 else Polytope
 
 
-def cut(polytope: Polytope, A: np.ndarray, b: np.ndarray, time: float = 0.0) -> Clipped:
+def box(p: int, half: float = BOX, count: int = 1) -> Solid:
+    return kind_for(p).from_box(tensor(np.full((count, p), -half)), tensor(np.full((count, p), half)))
+
+
+def cut(polytope: Solid, A: np.ndarray, b: np.ndarray, time: float = 0.0) -> Clipped:
     """Clip by rows (R, p), the same for every item, or (B, R, p)."""
     B = len(polytope.count)
     rows, right = tensor(A).expand(B, *A.shape[-2:]), tensor(b).expand(B, b.shape[-1])
@@ -34,12 +41,12 @@ def cut(polytope: Polytope, A: np.ndarray, b: np.ndarray, time: float = 0.0) -> 
     return polytope.clip(rows, right, stamp, torch.arange(b.shape[-1]).expand(right.shape), 1000)
 
 
-def rows_of(polytope: Polytope, item: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def rows_of(polytope: Solid, item: int = 0) -> tuple[np.ndarray, np.ndarray]:
     count = int(polytope.count[item])
     return polytope.A[item, :count].numpy(), polytope.b[item, :count].numpy()
 
 
-def points_of(polytope: Polytope, item: int = 0) -> np.ndarray:
+def points_of(polytope: Solid, item: int = 0) -> np.ndarray:
     return polytope.vertices[item, : int(polytope.vertex_count[item])].numpy()
 
 
@@ -51,7 +58,7 @@ def rows_around(rng: np.random.Generator, truth: np.ndarray, rows: int, slack: f
 
 def random_set(
     rng: np.random.Generator, p: int, rows: int = 8, width: float = 1.0
-) -> tuple[Polytope, np.ndarray, np.ndarray]:
+) -> tuple[Solid, np.ndarray, np.ndarray]:
     """A set, and all the rows that made it; below width 1, two rows close in on it to about `width`."""
     truth = rng.uniform(-0.6 * BOX, 0.6 * BOX, p)
     A, b = rows_around(rng, truth, rows, 3.0)
@@ -60,12 +67,12 @@ def random_set(
         b[:2] = A[:2] @ truth + width / 2 * np.linalg.norm(A[:2], axis=1)
     before = box(p)
     after = cut(before, A, b)
-    assert after.outcome == Outcome.NONEMPTY
+    assert after.outcome == Status.OK
     sides, ends = rows_of(before)
     return after.body, np.vstack([A, sides]), np.append(b, ends)
 
 
-def frame(body: Polytope) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def frame(body: Solid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Centre, axes (in rows) and scale: z = centre + (y * scale) axes."""
     points, centre = points_of(body), body.centroid()[0].numpy()
     _, spread, axes = np.linalg.svd(points - centre, full_matrices=False)

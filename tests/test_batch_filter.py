@@ -12,7 +12,7 @@ from tests.test_blocks import CLIPPED, blocks
 from torchfsid.errors import InputError
 from torchfsid.kernels.kalman import factor
 from torchfsid.observers.ukf import ParameterUkf
-from torchfsid.outcome import FilterStatus
+from torchfsid.outcome import Status
 from torchfsid.robots.measurement import Measurement
 
 
@@ -20,6 +20,7 @@ def measured(seed: int, wild: float = 0.0) -> list[Measurement]:
     """A team with errors and lost robots. Wild controls violate rows, so that motions are unknown, or are not true."""
     rng, found = np.random.default_rng(seed), []
     for k, sample in enumerate(team_run().measurements()):
+        assert sample.u is not None
         u = sample.u + torch.from_numpy(rng.uniform(-3e-4, 3e-4, (4, 2)))
         u[k % 4] += wild * (k % 9 == 5)
         sample = replace(sample, x=sample.x + torch.from_numpy(rng.normal(0, 1e-3, (4, 2))), u=u)
@@ -45,8 +46,8 @@ def compare(filterpy: ParameterUkf, samples: list[Measurement], size: int, toler
 def test_numbers_are_those_of_filterpy(settings: dict[str, Any], size: int) -> None:
     """Up to round-off of filterpy: against extended precision it is off by 6e-10 here, the compiled filter by 5e-13."""
     statuses = compare(ParameterUkf.from_prior(TEAM_TASK, TEAM_BARRIERS, *box(4), **settings), measured(1), size, 1e-9)
-    assert (statuses == FilterStatus.OK).float().mean() > 0.5
-    assert (statuses[1:] == FilterStatus.PREDICTED).any()
+    assert (statuses == Status.OK).float().mean() > 0.5
+    assert (statuses[1:] == Status.PREDICTED).any()
 
 
 def test_numbers_on_exact_data() -> None:
@@ -60,9 +61,9 @@ def test_wild_controls() -> None:
 
 
 @pytest.mark.parametrize(
-    ("broken", "status"), [(np.ones((4, 4)), FilterStatus.REPAIRED), (np.full((4, 4), np.nan), FilterStatus.FAILED)]
+    ("broken", "status"), [(np.ones((4, 4)), Status.REPAIRED), (np.full((4, 4), np.nan), Status.FAILED)]
 )
-def test_filterpy_takes_over_where_the_compiled_filter_stops(broken: np.ndarray, status: FilterStatus) -> None:
+def test_filterpy_takes_over_where_the_compiled_filter_stops(broken: np.ndarray, status: Status) -> None:
     samples, filterpy = measured(2), ParameterUkf.from_prior(TEAM_TASK, TEAM_BARRIERS, *box(4))
     batch = replace(filterpy, engine="batch")
     batch.read(Measurement.concatenate(samples[:12]))

@@ -45,8 +45,9 @@ def team(
         if broken and k >= 50:
             u[1] -= TEAM_TASK.gain * 1.5
         sample = Measurement.of_team(k * DT, run.x[k], u, previous_u=run.u[max(k - 1, 0)], seen=seen)
-        unseen = ~sample.observed.unsqueeze(-1)
-        found.append(replace(sample, x=sample.x.masked_fill(unseen, torch.nan), u=sample.u.masked_fill(unseen, 0.0)))
+        assert sample.observed is not None
+        unseen, u = ~sample.observed.unsqueeze(-1), u.masked_fill(~sample.observed.unsqueeze(-1), 0.0)
+        found.append(replace(sample, x=sample.x.masked_fill(unseen, torch.nan), u=u))
     return found
 
 

@@ -13,7 +13,7 @@ from tests.problems import exact_inscribed_radius
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.kernels import disc
 from torchfsid.observers.set_membership import SetMembershipObserver
-from torchfsid.outcome import Outcome
+from torchfsid.outcome import Status
 from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.measurement import Measurement
@@ -90,7 +90,7 @@ def test_two_pairs_of_opposite_edges(rows: list, bounds: list, expected: float) 
     sets = inside(np.array([rows]), np.array([bounds]), np.zeros((1, 2)))
     assert sets.chebyshev()[1].item() == pytest.approx(expected, rel=1e-14)
     verdict = sets.emptiness()
-    assert verdict.outcome.item() == Outcome.NONEMPTY
+    assert verdict.outcome.item() == Status.OK
     assert sets.contains(verdict.witness).all()
 
 
@@ -125,7 +125,7 @@ def test_a_robot_jammed_between_two_bodies_has_a_disc() -> None:
         present = torch.ones(count, 2, dtype=torch.bool)
         sets = watching.update(Measurement(float(sample), still, still, bodies, present)).feasible_set
     centre, radius = sets.chebyshev()
-    assert (sets.outcome == Outcome.NONEMPTY).all()
+    assert (sets.outcome == Status.OK).all()
     assert (radius > 0).all()
     assert torch.isfinite(radius).all()
     assert sets.contains(centre).all()

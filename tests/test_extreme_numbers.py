@@ -10,7 +10,7 @@ from torch import Tensor
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.kernels import disc
-from torchfsid.outcome import ProgrammeStatus
+from torchfsid.outcome import Status
 from torchfsid.programmes import exact
 from torchfsid.programmes.layers import ChebyshevCentre, ProjectOnto
 from torchfsid.sets.feasible_set import FeasibleSet
@@ -51,7 +51,7 @@ def test_numbers_beyond_all_floats_are_unsolved(p: int) -> None:
     A = 1e-308 * torch.cat([torch.eye(p), -torch.eye(p)]).double()
     ball = ChebyshevCentre()(Halfspaces(A, tensor([1e-308 if p == 3 else 1.0] * p + [1.0] * p)))
     nearest = ProjectOnto()(Halfspaces(A, tensor([1e-160] * p + [-1.0] * p)), torch.full((p,), 9.0))
-    assert ball.status == nearest.status == ProgrammeStatus.UNSOLVED
+    assert ball.status == nearest.status == Status.UNSOLVED
     assert ball.radius.isnan()
 
 
@@ -62,7 +62,7 @@ def test_a_ball_that_cannot_be_verified_is_still_in_the_set(p: int, monkeypatch:
 
     def unsolved(A: object, b: object) -> tuple:
         centre, radius, rows, status = inscribed_ball(A, b)
-        return centre * math.nan, radius * math.nan, rows, status * 0 + ProgrammeStatus.UNSOLVED
+        return centre * math.nan, radius * math.nan, rows, status * 0 + Status.UNSOLVED
 
     inscribed_ball, inscribed = exact.inscribed_ball, disc.inscribed
     monkeypatch.setattr(exact, "inscribed_ball", unsolved)

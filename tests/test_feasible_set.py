@@ -7,7 +7,7 @@ import torch
 
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.outcome import Outcome
+from torchfsid.outcome import Status
 from torchfsid.sets.feasible_set import MAX_FACETS, FeasibleSet
 
 TRUTH = {1: [0.3], 2: [0.3, -1.2], 3: [0.3, -1.2, 0.8], 4: [0.3, -1.2, 0.8, 0.1]}
@@ -34,7 +34,7 @@ def test_truth_stays_inside_and_volume_never_grows(p: int) -> None:
         smaller = theta.volume()
         assert theta.contains(truth).all()
         assert (smaller <= volume * (1 + 1e-12)).all()
-        assert (theta.outcome == Outcome.NONEMPTY).all()
+        assert (theta.outcome == Status.OK).all()
         volume = smaller
     assert (volume < 0.5 * 4.0**p).all()
 
@@ -96,7 +96,7 @@ def test_emptiness_comes_with_rows_that_contradict(p: int) -> None:
     second = Halfspaces(-axis, torch.tensor([[0.5], [0.5]]))
     theta = box(p, batch=2).intersect(first, time=1.0).intersect(second, time=2.0)
     verdict = theta.emptiness()
-    assert verdict.outcome.tolist() == [Outcome.EMPTY, Outcome.NONEMPTY]
+    assert verdict.outcome.tolist() == [Status.EMPTY, Status.OK]
     assert theta.volume()[0] == 0
     assert not theta.contains(torch.zeros(p, dtype=torch.float64).expand(2, p))[0]
     assert bool(theta.contains(verdict.witness)[1])
@@ -114,7 +114,7 @@ def test_emptiness_comes_with_rows_that_contradict(p: int) -> None:
 def test_touching_is_undecided_and_stays_in() -> None:
     """x <= -2 meets the box [-2, 2]^2 in an edge: neither surely empty nor of any size."""
     theta = box(2, batch=1).intersect(Halfspaces(torch.tensor([[1.0, 0.0]]), torch.tensor([-2.0])))
-    assert theta.emptiness().outcome.item() == Outcome.UNDECIDED
+    assert theta.emptiness().outcome.item() == Status.UNDECIDED
     assert theta.emptiness().witness.isnan().all()
     assert 0 <= theta.volume().item() < 1e-12
     edge = torch.tensor([[[-2.0, y]] for y in (-2.0, 0.3, 2.0)], dtype=torch.float64)

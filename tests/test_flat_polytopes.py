@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tests.polytopes import box, cut, rows_of, tensor
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.outcome import Outcome
+from torchfsid.outcome import Status
 from torchfsid.sets.feasible_set import FeasibleSet
 
 SIDE = 5.0
@@ -56,7 +56,7 @@ def test_boxes_cut_to_facets_edges_and_points_in_any_order(p: int, turned: bool)
         for theta in (prior(p, len(ways)).intersect(Halfspaces(A, b)), one_by_one(prior(p, len(ways)), A, b)):
             again = one_by_one(theta, A, b)
             for flat in (theta, again):
-                assert (flat.outcome == Outcome.UNDECIDED).all()
+                assert (flat.outcome == Status.UNDECIDED).all()
                 assert flat.contains(tensor(truth).expand(len(ways), p)).all()
                 across = flat.vertices() @ tensor(Q[:pinned]).T - tensor(Q[:pinned] @ truth)
                 assert across.abs().max() < NOISE
@@ -101,7 +101,7 @@ def test_a_smaller_bound_never_gives_a_larger_set(p: int, around: float) -> None
             start = prior(p, len(ways), around)
             found = []
             for theta in (start.intersect(Halfspaces(*rows_in_order)), one_by_one(start, *rows_in_order)):
-                assert (theta.outcome != Outcome.EMPTY).all()
+                assert (theta.outcome != Status.EMPTY).all()
                 assert theta.contains(tensor(truth).expand(len(ways), p)).all()
                 found.append(
                     torch.stack([theta.support(direction.expand(len(ways), p)) for direction in directions], dim=-1)
@@ -120,16 +120,16 @@ def test_a_row_that_only_touches_leaves_a_sliver(p: int) -> None:
     for k in range(1, p + 1):
         row = -np.append(np.ones(k), np.zeros(p - k))
         touched = cut(block, row[None], np.array([-float(k)]))
-        assert touched.outcome == Outcome.UNDECIDED
+        assert touched.outcome == Status.UNDECIDED
         assert touched.shrunk
         assert touched.body.volume() == 0
         assert touched.body.centroid()[0].numpy() == pytest.approx(-row, abs=NOISE)
         A, b = rows_of(touched.body)
         (moved,) = b[touched.body.source[0, : len(b)].numpy() == 0]
         assert -k < moved < -k + NOISE
-        assert cut(block, row[None], np.array([-k - 1e-9])).outcome == Outcome.EMPTY
+        assert cut(block, row[None], np.array([-k - 1e-9])).outcome == Status.EMPTY
         less = cut(block, row[None], np.array([-k + 1e-9]))
-        assert less.outcome == Outcome.NONEMPTY
+        assert less.outcome == Status.OK
         assert touched.body.support(tensor(A)[None]).amax() <= less.body.support(tensor(A)[None]).amax() + NOISE
         assert not cut(block, -row[None], np.array([float(k)])).shrunk
 
@@ -160,7 +160,7 @@ def test_a_truth_at_the_apex_of_a_sharp_cone_is_never_lost(p: int, half: float) 
     theta, turns = FeasibleSet.from_box(truth.round() - 2, truth.round() + 2), b.shape[-1] - 5
     for rows in (slice(0, turns), *(slice(k, k + 1) for k in range(turns, b.shape[-1]))):
         theta = theta.intersect(Halfspaces(A[:, rows], b[:, rows]))
-        assert (theta.outcome != Outcome.EMPTY).all()
+        assert (theta.outcome != Status.EMPTY).all()
         assert theta.contains(truth).all()
         for answer in (*theta.chebyshev(), theta.centroid(), theta.project(truth + 5), theta.volume()):
             assert answer.isfinite().all()

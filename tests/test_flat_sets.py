@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.observers.set_membership import SetMembershipObserver
-from torchfsid.outcome import Outcome
+from torchfsid.outcome import Status
 from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.barriers import SpeedBox
 from torchfsid.robots.bounds import NoiseBound
@@ -43,7 +43,7 @@ def test_two_opposite_rows_leave_a_segment(flipped: bool) -> None:
     if flipped:
         A = A.flip(0)
     segment = box(1).intersect(Halfspaces(A, b), time=1.0)
-    assert segment.outcome.tolist() == [Outcome.UNDECIDED]
+    assert segment.outcome.tolist() == [Status.UNDECIDED]
     assert segment.last_cut.tolist() == [1.0]
     assert 0 <= segment.volume().item() < 1e-12
     assert segment.diameter().item() == pytest.approx(10.0)
@@ -142,7 +142,7 @@ def test_what_cannot_be_decided_leaves_a_sliver_that_holds_the_apex() -> None:
     A = torch.tensor([[[1e-11, 1.0], [1e-11, -1.0], [-1.0, 0.0]]], dtype=torch.float64)
     b = torch.tensor([[1e-11, 1e-11, -1.0 - 1e-6]], dtype=torch.float64)
     sets = box(1, half=2.0).intersect(Halfspaces(A, b))
-    assert sets.outcome.tolist() == [Outcome.UNDECIDED]
+    assert sets.outcome.tolist() == [Status.UNDECIDED]
     assert sets.volume().item() < 1e-12
     assert sets.diameter().item() < 1e-3
 

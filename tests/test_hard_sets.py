@@ -14,7 +14,7 @@ from torch import Tensor
 
 from tests.hard_sets import hard_sets, padded
 from torchfsid import ChebyshevCentre, Halfspaces, ProjectOnto
-from torchfsid.outcome import ProgrammeStatus
+from torchfsid.outcome import Status
 from torchfsid.programmes import exact, rational
 
 ROUND_OFF = 128 * 2.0**-52
@@ -45,7 +45,7 @@ def test_parallelograms_of_nearly_parallel_sides(A, b, radius):
     sides = torch.cat([torch.eye(2), -torch.eye(2)]).double()
     halfspaces = Halfspaces(torch.cat([tensor(*A), sides]), torch.cat([tensor(*b), torch.full((4,), 5.0).double()]))
     ball = ChebyshevCentre()(halfspaces)
-    assert ball.status == ProgrammeStatus.OK
+    assert ball.status == Status.OK
     assert float(ball.radius) == pytest.approx(radius, abs=1e-7)
     assert float(halfspaces.slack(ball.centre).min()) == pytest.approx(radius, abs=1e-7)
 
@@ -54,7 +54,7 @@ def test_parallelograms_of_nearly_parallel_sides(A, b, radius):
 def test_balls_fit_and_none_is_larger(p):
     sets = hard_sets(p, each=3)
     centre, radius, _, status = exact.inscribed_ball(*padded(sets))
-    assert (status == ProgrammeStatus.OK).all()
+    assert (status == Status.OK).all()
     for (A, b), z, r in zip(sets, centre, radius, strict=True):
         lengths = np.linalg.norm(A, axis=1)
         room = ROUND_OFF * (np.abs(b / lengths).max() + np.abs(z).sum())
@@ -79,7 +79,7 @@ def test_points_are_inside_and_balanced(p):
     A, b = padded(sets)
     y = 6 * np.random.default_rng(p).normal(size=(len(sets), p))
     z, mu, rows, filled, status = exact.nearest_point(A, b, y)
-    assert (status == ProgrammeStatus.OK).all()
+    assert (status == Status.OK).all()
     for i, (own, bounds) in enumerate(sets):
         every = np.zeros(len(bounds))
         np.add.at(every, rows[i][filled[i]], mu[i][filled[i]])
@@ -97,14 +97,14 @@ def test_the_rational_programmes_say_the_same(p):
     for i, (own, bounds) in enumerate(sets):
         point, mu, rows, filled = np.zeros(p), np.zeros(p), np.zeros(p, dtype=np.int64), np.zeros(p, dtype=bool)
         status = rational.nearest_point(own, bounds, y[i], np.empty((0, p, p)), point, mu, rows, filled)
-        assert status == ProgrammeStatus.OK
+        assert status == Status.OK
         every = np.zeros(len(bounds))
         np.add.at(every, rows[filled], mu[filled])
         conditions(own, bounds, y[i], point, every)
         assert np.linalg.norm(point - y[i]) == pytest.approx(np.linalg.norm(z[i] - y[i]), rel=1e-9)
         centre, touching = np.zeros(p), np.zeros(p + 1, dtype=np.int64)
         r, status = rational.inscribed_ball(own, bounds, exact.simplex_around(p), centre, touching)
-        assert status == ProgrammeStatus.OK
+        assert status == Status.OK
         lengths = np.linalg.norm(own, axis=1)
         room = ROUND_OFF * (np.abs(bounds / lengths).max() + np.abs(centre).sum())
         assert r == pytest.approx(radius[i], abs=8 * room)
@@ -122,7 +122,7 @@ def test_what_the_kernel_cannot_verify_is_solved_in_rationals(monkeypatch):
 
         def gives_up(*arguments, whole=whole):
             whole(*arguments)
-            arguments[-1][:] = ProgrammeStatus.UNSOLVED
+            arguments[-1][:] = Status.UNSOLVED
 
         monkeypatch.setattr(exact.kernel, name, gives_up)
     again = exact.nearest_point(A, b, y)
@@ -135,7 +135,7 @@ def test_what_the_kernel_cannot_verify_is_solved_in_rationals(monkeypatch):
     halfspaces = Halfspaces(*leaves[:2])
     point, ball = ProjectOnto()(halfspaces, leaves[2]), ChebyshevCentre()(halfspaces)
     for answer in (point.status, ball.status):
-        assert (answer == ProgrammeStatus.UNSOLVED).all()
+        assert (answer == Status.UNSOLVED).all()
     for value in (point.point, ball.centre, ball.radius):
         assert value.isnan().all()
         for gradient in torch.autograd.grad(value.sum(), leaves, allow_unused=True, retain_graph=True):
@@ -174,7 +174,7 @@ def test_what_is_no_metric_has_no_nearest_point(p):
     for metric in metrics:
         metric = metric.double().requires_grad_()
         point, status = ProjectOnto(metric)(halfspaces, y)
-        assert status == ProgrammeStatus.UNDEFINED
+        assert status == Status.UNDEFINED
         assert point.isnan().all()
         for gradient in torch.autograd.grad(point.sum(), (y, metric)):
             assert torch.equal(gradient, torch.zeros_like(gradient))
@@ -190,7 +190,7 @@ def test_stretched_metrics(p, condition):
     A, b = rng.normal(size=(100, 3 * p + 3, p)), rng.uniform(0.2, 1, (100, 3 * p + 3))
     y = 5 * rng.normal(size=(100, p))
     z, mu, rows, _, status = exact.nearest_point(A, b, y, H)
-    assert (status == ProgrammeStatus.OK).all()
+    assert (status == Status.OK).all()
     assert (np.einsum("bmp,bp->bm", A, z) - b).max() <= 1e-12
     pull = np.einsum("bij,bj->bi", H, z - y) + np.einsum("bs,bsp->bp", mu, A[np.arange(100)[:, None], rows])
     assert (np.abs(pull).max(-1) <= 1e-10 * np.abs(H).max((1, 2))).all()
@@ -203,9 +203,9 @@ def test_numbers_that_are_none(bad, where):
     given[where].view(-1)[0] = bad
     leaves = [value.requires_grad_() for value in given.values()]
     point, ball = ProjectOnto()(Halfspaces(*leaves[:2]), leaves[2]), ChebyshevCentre()(Halfspaces(*leaves[:2]))
-    assert point.status == ProgrammeStatus.UNDEFINED
+    assert point.status == Status.UNDEFINED
     assert point.point.isnan().all()
-    assert ball.status == (ProgrammeStatus.OK if where == "y" else ProgrammeStatus.UNDEFINED)
+    assert ball.status == (Status.OK if where == "y" else Status.UNDEFINED)
     for gradient in torch.autograd.grad(point.point.sum(), leaves):
         assert torch.equal(gradient, torch.zeros_like(gradient))
 
@@ -230,4 +230,4 @@ def test_a_contradiction_does_not_depend_on_the_scale_of_rows(scale: float):
     A = torch.tensor([[1.0, 0.0], [-1.0, 0.0]], dtype=torch.float64)
     b = torch.tensor([1.0, -1.0 - 1e-10], dtype=torch.float64)
     found = ProjectOnto()(Halfspaces(A * scale, b * scale), torch.tensor([16.0, 32.0]))
-    assert int(found.status) == ProgrammeStatus.EMPTY
+    assert int(found.status) == Status.EMPTY

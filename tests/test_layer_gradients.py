@@ -12,7 +12,7 @@ from torch.autograd import gradcheck, gradgradcheck
 from tests.test_layers import random_sets, spd, tensor, triangle_ball
 from torchfsid import ChebyshevCentre, Halfspaces, ProjectOnto
 from torchfsid.errors import InputError
-from torchfsid.outcome import ProgrammeStatus
+from torchfsid.outcome import Status
 from torchfsid.programmes.conic import ActiveRowsSolver, CvxpyLayer
 
 EXACT_BALL, EXACT_POINT = ChebyshevCentre(), ProjectOnto()
@@ -141,8 +141,8 @@ def test_no_gradient_is_nan():
     leaves = [t.requires_grad_() for t in (A, b, y)]
     halfspaces = Halfspaces(A, b)
     (point, of_point), ball = EXACT_POINT(halfspaces, y), EXACT_BALL(halfspaces)
-    assert point[of_point == ProgrammeStatus.OK].isfinite().all()
-    assert ball.centre[ball.status == ProgrammeStatus.OK].isfinite().all()
+    assert point[of_point == Status.OK].isfinite().all()
+    assert ball.centre[ball.status == Status.OK].isfinite().all()
     counts = ball.status.bincount(minlength=3)
     assert (counts[:3] > 20).all()
     for answer in (point, ball.centre, ball.radius):
@@ -173,7 +173,7 @@ def test_both_backends_agree(p):
         halfspaces = Halfspaces(*leaves[:2])
         projected = ProjectOnto(spd(p), backend)(halfspaces, leaves[2])
         ball = ChebyshevCentre(backend)(halfspaces)
-        ok = ball.status == ProgrammeStatus.OK
+        ok = ball.status == Status.OK
         loss = projected.point.sum() + ball.radius[ok].sum() + ball.centre[ok].sum()
         of_A, of_b, of_y = torch.autograd.grad(loss, leaves)
         values = [projected.point / unit[:, None], ball.centre / unit[:, None], ball.radius / unit]
@@ -239,7 +239,7 @@ def test_compiled_first_derivatives_are_those_of_the_graph(p):
     A, b, y = (t.requires_grad_() for t in random_sets(200, 2 * p + 2, p, seed=80 + p, least=-0.2))
     halfspaces = Halfspaces(A, b)
     point, ball = EXACT_POINT(halfspaces, y).point, EXACT_BALL(halfspaces)
-    assert ball.status.unique().tolist() == [ProgrammeStatus.OK, ProgrammeStatus.EMPTY, ProgrammeStatus.UNBOUNDED]
+    assert ball.status.unique().tolist() == [Status.OK, Status.EMPTY, Status.UNBOUNDED]
     weights = torch.randn(200, p, dtype=torch.float64)
     for loss in ((point * weights).sum(), (ball.centre * weights).sum(), ball.radius.sum()):
         compiled = torch.autograd.grad(loss, (A, b, y), retain_graph=True, allow_unused=True)

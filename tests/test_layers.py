@@ -13,7 +13,7 @@ from torch.func import grad, hessian, jacrev, vmap
 
 from torchfsid import ChebyshevCentre, Halfspaces, ProjectOnto
 from torchfsid.errors import InputError
-from torchfsid.outcome import ProgrammeStatus
+from torchfsid.outcome import Status
 
 BACKENDS = pytest.mark.parametrize("backend", ["exact", "cvxpylayers"])
 
@@ -49,13 +49,13 @@ def test_projections_agree_with_daqp(p, mahalanobis):
         lengths = A[i].norm(dim=-1, keepdim=True)
         unit, right = (A[i] / lengths).numpy(), (b[i] / lengths[:, 0]).numpy()
         expected, _, flag, _ = daqp.solve(H, -H @ y[i].numpy(), unit, right, primal_tol=1e-12, dual_tol=1e-12)
-        assert status[i] == (ProgrammeStatus.OK if flag == 1 else ProgrammeStatus.EMPTY)
+        assert status[i] == (Status.OK if flag == 1 else Status.EMPTY)
         if flag == 1:
             np.testing.assert_allclose(point[i].numpy(), expected, atol=1e-8)
         else:
             assert point[i].isnan().all()
-    assert (status == ProgrammeStatus.OK).sum() > 10
-    assert (status == ProgrammeStatus.EMPTY).sum() > 5
+    assert (status == Status.OK).sum() > 10
+    assert (status == Status.EMPTY).sum() > 5
 
 
 @pytest.mark.parametrize("p", [1, 2, 3, 5])
@@ -66,14 +66,14 @@ def test_radius_and_depth_of_emptiness_agree_with_highs(p):
         rows = np.column_stack([A[i].numpy(), A[i].norm(dim=-1).numpy()])
         highs = linprog(np.append(np.zeros(p), -1.0), A_ub=rows, b_ub=b[i].numpy(), bounds=(None, None))
         if highs.status != 0:
-            assert status[i] == ProgrammeStatus.UNBOUNDED
+            assert status[i] == Status.UNBOUNDED
             continue
         np.testing.assert_allclose(float(radius[i]), highs.x[-1], atol=1e-9)
-        assert status[i] == (ProgrammeStatus.OK if highs.x[-1] > 0 else ProgrammeStatus.EMPTY)
+        assert status[i] == (Status.OK if highs.x[-1] > 0 else Status.EMPTY)
         # The ball is where it is said to be: no row is nearer than its radius.
         np.testing.assert_allclose(float(Halfspaces(A[i], b[i]).slack(centre[i]).min()), float(radius[i]), atol=1e-12)
-    assert (status == ProgrammeStatus.EMPTY).sum() > 5
-    assert (status == ProgrammeStatus.OK).sum() > 5
+    assert (status == Status.EMPTY).sum() > 5
+    assert (status == Status.OK).sum() > 5
 
 
 def triangle_ball(height: float) -> tuple[Tensor, Tensor, float]:
@@ -87,12 +87,12 @@ def test_thin_triangles_far_from_the_origin(height):
     A, b, radius = triangle_ball(height)
     away = tensor(30.0, -20.0)
     ball = ChebyshevCentre()(Halfspaces(A, b + A @ away))
-    assert ball.status == ProgrammeStatus.OK
+    assert ball.status == Status.OK
     # What round-off leaves of an offset of size 50.
     assert float(ball.radius) == pytest.approx(radius, abs=1e-13)
     torch.testing.assert_close(ball.centre, away + tensor(0.0, radius), atol=1e-13 / height, rtol=0)
     tip, status = ProjectOnto()(Halfspaces(A, b + A @ away), away + tensor(0.0, 5.0))
-    assert status == ProgrammeStatus.OK
+    assert status == Status.OK
     torch.testing.assert_close(tip, away + tensor(0.0, height), atol=1e-13 / height, rtol=0)
 
 
@@ -129,7 +129,7 @@ def test_one_bad_item_does_not_spoil_the_batch(backend):
     y = tensor(2.0, 0.5).expand(8, 2).clone().requires_grad_()
 
     ball = ChebyshevCentre(backend)(Halfspaces(A, b))
-    S = ProgrammeStatus
+    S = Status
     assert ball.status.tolist() == [
         S.OK, S.EMPTY, S.EMPTY, S.UNBOUNDED, S.DEGENERATE, S.UNDEFINED, S.UNBOUNDED, S.OK
     ]  # fmt: skip
@@ -164,7 +164,7 @@ def test_no_rows_no_items_and_only_padding(backend):
     y = torch.ones(2, 3, dtype=torch.float64)
     point, status = ProjectOnto(backend=backend)(free, y)
     assert torch.equal(point, y)
-    assert status.tolist() == [ProgrammeStatus.OK] * 2
+    assert status.tolist() == [Status.OK] * 2
     assert ChebyshevCentre(backend)(free).radius.tolist() == [math.inf] * 2
     padding = Halfspaces(torch.zeros(2, 4, 3), torch.ones(2, 4))
     assert torch.equal(ProjectOnto(backend=backend)(padding, y).point, y)
@@ -177,7 +177,7 @@ def test_a_metric_that_is_none_is_a_status():
     A, b, y = random_sets(3, 6, 2, seed=0)
     metric = torch.stack([spd(2), tensor([1.0, 2.0], [2.0, 1.0]), tensor([1.0, math.nan], [0.0, 1.0])])
     point, status = ProjectOnto(metric)(Halfspaces(A, b), y)
-    assert status.tolist() == [ProgrammeStatus.OK, ProgrammeStatus.UNDEFINED, ProgrammeStatus.UNDEFINED]
+    assert status.tolist() == [Status.OK, Status.UNDEFINED, Status.UNDEFINED]
     assert point[0].isfinite().all()
 
 

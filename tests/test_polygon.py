@@ -26,7 +26,7 @@ from tests.problems import (
     exactly_feasible,
     solve_qp,
 )
-from torchfsid.outcome import Outcome
+from torchfsid.outcome import Status
 from torchfsid.sets.body import Clipped
 from torchfsid.sets.polygon import Polygon
 from torchfsid.tolerances import ROUND_OFF
@@ -134,7 +134,7 @@ def test_thin_sets_keep_the_truth_and_their_area(width: float, needle: bool):
     for step in range(20):
         A, b = rows_around(rng, truth, 6, max(width, 10.0**-step), needle)
         result = cut(polygon, A, b)
-        assert (result.outcome == Outcome.NONEMPTY).all()
+        assert (result.outcome == Status.OK).all()
         slivers = ROUND_OFF * BOX * perimeter(polygon)
         assert (result.body.volume() <= polygon.volume() + slivers).all()
         polygon = result.body
@@ -284,8 +284,8 @@ def test_outcome_when_sets_touch():
     """At a vertex, along an edge, and a hair further off, a hair less, not at all."""
     rows = np.array([[[-1.0, -1.0]], [[-1.0, 0.0]], [[-1.0, -1.0]], [[-1.0, -1.0]], [[-1.0, 0.0]]])
     result = cut(boxes(5, half=1.0), rows, np.array([[-2.0], [-1.0], [-2.0 - 1e-13], [-2.0 + 1e-13], [-2.0]]))
-    names = [Outcome(int(outcome)).name for outcome in result.outcome]
-    assert names == ["UNDECIDED", "UNDECIDED", "EMPTY", "NONEMPTY", "EMPTY"]
+    names = [Status(int(outcome)).name for outcome in result.outcome]
+    assert names == ["UNDECIDED", "UNDECIDED", "EMPTY", "OK", "EMPTY"]
     area, diameter = result.body.volume(), result.body.diameter()
     assert area[[2, 4]].tolist() == [4.0] * 2  # of empty ones the polygon before
     assert area[[0, 1, 3]].max() < 1e-12
@@ -298,7 +298,7 @@ def test_empty_intersection_leaves_the_polygon_as_it_was():
     rows, bounds = np.array([[[1.0, 0.0], [-1.0, 0.5], [0.0, 1.0]]] * 2), np.array([[-8.0, 2.0, 3.0], [2.0, 8.0, 3.0]])
     before = cut(boxes(2), np.array([[[1.0, 2.0]]] * 2), np.array([[9.0]] * 2), time=1.0).body
     result = cut(before, rows, bounds, time=2.0)
-    assert result.outcome.tolist() == [Outcome.EMPTY, Outcome.NONEMPTY]
+    assert result.outcome.tolist() == [Status.EMPTY, Status.OK]
     assert result.shrunk.tolist() == [False, True]
     assert torch.equal(result.body.volume()[:1], before.volume()[:1])
     assert result.body.count[0] == before.count[0]
@@ -308,7 +308,7 @@ def test_empty_intersection_leaves_the_polygon_as_it_was():
 
 def test_emptiness_is_exactly_right_or_undecided():
     """Rows of small integers, which often touch exactly: a decided answer is the exact one, and its three rows exclude
-    each other in exact rationals. 2 500 sequences of 3 rows at a time until an answer other than NONEMPTY."""
+    each other in exact rationals. 2 500 sequences of 3 rows at a time until an answer other than OK."""
     rng, count, table = np.random.default_rng(0), 2500, Counter()
     polygon, rings, going_on = boxes(count, half=5.0), [exact_box((-5, -5), (5, 5))] * count, np.ones(count, dtype=bool)
     while going_on.any():
@@ -319,10 +319,10 @@ def test_emptiness_is_exactly_right_or_undecided():
         for i in np.flatnonzero(going_on):
             rings[i] = exact_intersection(rings[i], A[i], b[i])
             truth = "empty" if not rings[i] else "flat" if exact_area(rings[i]) == 0 else "fat"
-            outcome = Outcome(int(result.outcome[i]))
+            outcome = Status(int(result.outcome[i]))
             table[truth, outcome.name] += 1
-            going_on[i] = (truth, outcome) == ("fat", Outcome.NONEMPTY)
-            if outcome is Outcome.EMPTY:
+            going_on[i] = (truth, outcome) == ("fat", Status.OK)
+            if outcome is Status.EMPTY:
                 table["touching contradiction"] += exactly_feasible(against.A[i].numpy(), against.b[i].numpy())
     assert table["touching contradiction"] == 0
     assert table["flat", "UNDECIDED"] + table["empty", "UNDECIDED"] + table["empty", "EMPTY"] == count
@@ -340,8 +340,8 @@ def test_any_sequence_of_rows(rows: list[tuple[float, float, float]]):
         area = polygon.volume()
         polygon, exact_ring = result.body, exact_intersection(exact_ring, A[0], b[0])
         assert (polygon.volume() <= area + ROUND_OFF * BOX * perimeter(polygon)).all()
-        assert result.outcome != Outcome.EMPTY or not exact_ring
-        if result.outcome != Outcome.NONEMPTY or not exact_ring:
+        assert result.outcome != Status.EMPTY or not exact_ring
+        if result.outcome != Status.OK or not exact_ring:
             return
         room = 2 * ROUND_OFF * BOX * float(perimeter(polygon))
         assert float(polygon.volume()) == pytest.approx(float(exact_area(exact_ring)), abs=room)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
+from tests.polytopes import Solid, kind_for
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.observers.set_membership import SetKind, SetMembershipObserver
 from torchfsid.outcome import Status
@@ -20,7 +21,6 @@ from torchfsid.robots.simulation import simulate
 from torchfsid.robots.tasks import UnknownGainGoalTask
 from torchfsid.sets.feasible_set import FeasibleSet
 from torchfsid.sets.polygon import Polygon
-from torchfsid.sets.polytope import Polytope
 
 DIMENSIONS = [1, 3, 4]
 
@@ -34,9 +34,9 @@ def corners(p: int, half: float, count: int) -> tuple[Tensor, Tensor]:
     return -upper, upper
 
 
-def clipped(A: Tensor, b: Tensor, body: Polytope | None = None, half: float = 2.0) -> Polytope:
+def clipped(A: Tensor, b: Tensor, body: Solid | None = None, half: float = 2.0) -> Solid:
     """A box (or body) cut by rows (B, R, p)."""
-    body = Polytope.from_box(*corners(A.shape[-1], half, len(A))) if body is None else body
+    body = kind_for(A.shape[-1]).from_box(*corners(A.shape[-1], half, len(A))) if body is None else body
     time, source = torch.zeros(b.shape, dtype=torch.float64), torch.zeros(b.shape, dtype=torch.long)
     return body.clip(A, b, time, source, 1000).body
 
@@ -64,7 +64,7 @@ def metric(factor: Tensor) -> Tensor:
     return factor @ factor.mT + torch.eye(factor.shape[-1], dtype=factor.dtype)
 
 
-def measures(body: Polytope, points: Tensor, directions: Tensor, factors: Tensor) -> dict[str, Tensor]:
+def measures(body: Solid, points: Tensor, directions: Tensor, factors: Tensor) -> dict[str, Tensor]:
     centre, radius = body.chebyshev()
     return {
         "volume": body.volume(), "centroid": body.centroid(), "vertices": body.vertices, "centre": centre,
@@ -99,7 +99,7 @@ def test_the_box_that_a_set_begins_with(p: int) -> None:
     lower, upper = (corner.requires_grad_() for corner in corners(p, 2.0, 2))
 
     def of(lower: Tensor, upper: Tensor) -> tuple[Tensor, ...]:
-        body = clipped(A, b, Polytope.from_box(lower, upper))
+        body = clipped(A, b, kind_for(p).from_box(lower, upper))
         return body.volume(), body.centroid(), body.vertices, *body.chebyshev()
 
     assert gradcheck(of, (lower, upper))
@@ -237,7 +237,7 @@ def test_gradients_of_rough_sets_are_finite(p: int, kind: str) -> None:
     """Rows through the truth, repeated up to round-off, closing in to 1e-12; first and second derivatives."""
     for seed in range(4):
         rng, leaves = np.random.default_rng([p, seed]), []
-        truth, body = np.round(rng.uniform(-4, 4, p)), Polytope.from_box(*corners(p, 10.0, 1))
+        truth, body = np.round(rng.uniform(-4, 4, p)), kind_for(p).from_box(*corners(p, 10.0, 1))
         for step in range(8):
             A = rng.normal(size=(5, p)) * np.exp(rng.normal(size=(5, 1)))
             slack = 3 * 0.7**step * rng.exponential(size=5) * np.linalg.norm(A, axis=1)
@@ -282,7 +282,7 @@ def test_where_no_gradient_is_required_there_is_none_and_numbers_do_not_depend_o
 def test_the_graph_has_the_size_of_the_facets(p: int) -> None:
     """After 200 cuts. The gradient of the volume is that of scaling the set."""
     rng, scale = np.random.default_rng(p), torch.ones((), dtype=torch.float64, requires_grad=True)
-    body = Polytope.from_box(*corners(p, 9.0, 2))
+    body = kind_for(p).from_box(*corners(p, 9.0, 2))
     for k in range(200):
         A = tensor(rng.normal(size=(2, 4, p)))
         body = clipped(A, scale * A.norm(dim=-1) * 0.97**k, body)

@@ -18,7 +18,7 @@ from torchfsid.halfspaces import Halfspaces
 from torchfsid.identification.evidence import ObservationModel, evidence
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.observers.ukf import ParameterUkf
-from torchfsid.outcome import FilterStatus, Status
+from torchfsid.outcome import Status
 from torchfsid.robots.affine_barrier import AffineBarrier
 from torchfsid.robots.barriers import SpeedBox
 from torchfsid.robots.bounds import ErrorBounds, NoiseBound
@@ -222,7 +222,7 @@ def test_the_filter(task: str, inside: bool) -> None:
     ukf = ParameterUkf.from_prior(TASKS[task], barriers_of("none"), -corner, corner, qp_inside=inside)
     for k in range(len(run.t)):
         estimate = ukf.update(run.measurement(k))
-    assert (estimate.status == FilterStatus.OK).all()
+    assert (estimate.status == Status.OK).all()
     assert (estimate.theta - goals).norm(dim=-1).median() < 0.2
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.outcome import Outcome
+from torchfsid.outcome import Status
 from torchfsid.sets.feasible_set import FeasibleSet
 
 Rows = tuple[np.ndarray, np.ndarray]
@@ -39,7 +39,7 @@ def test_a_truth_at_the_apex_is_not_refuted(half: float) -> None:
     A, b = (torch.from_numpy(np.stack(part)) for part in zip(*rows, strict=True))
     corner = torch.full((300, 2), 2.0, dtype=torch.float64)
     after = FeasibleSet.from_box(-corner, corner).intersect(Halfspaces(A, b))
-    assert not bool((after.outcome == Outcome.EMPTY).any())
+    assert not bool((after.outcome == Status.EMPTY).any())
     assert bool(after.contains(torch.from_numpy(np.stack(truths))).all())
 
 

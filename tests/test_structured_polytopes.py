@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tests.polytopes import tensor
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.outcome import Outcome
+from torchfsid.outcome import Status
 from torchfsid.sets.feasible_set import FeasibleSet
 
 HALF = 5.0
@@ -66,7 +66,7 @@ def test_every_number_is_right(p: int, kind: str) -> None:
         truth, width = centre + rng.uniform(-2, 2, p), 10 ** rng.uniform(-6, 0) * max(1.0, 1e-3 * np.abs(centre).max())
         A, slack = nearly_parallel(rng, p, kind, angle, width)
         theta = box_around(tensor(centre).round()).intersect(Halfspaces(tensor(A), tensor(A @ truth + slack)))
-        assert theta.outcome == Outcome.NONEMPTY
+        assert theta.outcome == Status.OK
         assert theta.contains(tensor(truth))
         sides = np.vstack([np.eye(p), -np.eye(p)])
         rows, right = np.vstack([A, sides]), np.append(A @ truth + slack, sides @ centre.round() + HALF)

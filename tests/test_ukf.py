@@ -27,7 +27,7 @@ from tests.filters import (
 )
 from torchfsid.errors import InputError, SolverError
 from torchfsid.observers.ukf import FLOOR, ParameterUkf
-from torchfsid.outcome import FilterStatus
+from torchfsid.outcome import Status
 from torchfsid.robots.barriers import SpeedBox
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement
@@ -81,7 +81,7 @@ def test_equals_a_plain_kalman_filter(team: Trajectory) -> None:
     noises = {"position_noise": 0.02, "motion_noise": 0.003, "process_noise": 0.01}
     ukf = ParameterUkf(TEAM_TASK, TEAM_BARRIERS, torch.zeros(4, 2), 3.0, **noises)
     estimates = [ukf.update(team.measurement(k)) for k in samples]
-    assert all(bool((estimate.status == FilterStatus.OK).all()) for estimate in estimates[1:])
+    assert all(bool((estimate.status == Status.OK).all()) for estimate in estimates[1:])
     for robot in range(4):
         history = kalman_filter(team, robot, samples, 3.0, noises)
         for estimate, (theta, covariance) in zip(estimates, history, strict=True):
@@ -156,7 +156,7 @@ def test_qp_inside_learns_through_changes_of_the_active_set(two_pairs: Trajector
     assert len(two_pairs.active.unique(dim=0)) > 2
     ukf = ParameterUkf.from_prior(TASK, BARRIERS, *box(1), qp_inside=True)
     estimates = [ukf.update(two_pairs.measurement(k)) for k in range(53)]
-    assert all(estimate.status.item() == FilterStatus.OK for estimate in estimates[1:])
+    assert all(estimate.status.item() == Status.OK for estimate in estimates[1:])
     assert (estimates[20].theta - GOAL).norm() < 0.5 * GOAL.norm()
     assert estimates[20].covariance[0].diagonal().amin() < 0.5 * 12
     assert (estimates[-1].theta - GOAL).norm() < 0.05
@@ -173,9 +173,9 @@ def test_a_solver_that_fails_leaves_the_motion_unknown(monkeypatch: pytest.Monke
     with monkeypatch.context() as patch:
         patch.setattr("torchfsid.observers.motions.solve_safe_qp", fails)
         estimate = ukf.update(second)
-    assert estimate.status.item() == FilterStatus.PREDICTED
+    assert estimate.status.item() == Status.PREDICTED
     torch.testing.assert_close(estimate.theta, before.theta, atol=0, rtol=0)
-    assert ukf.update(third).status.item() == FilterStatus.OK
+    assert ukf.update(third).status.item() == Status.OK
 
 
 # Interface ----------------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np  # its broadcast_shapes does not wait for sympy
 import torch
@@ -133,6 +134,22 @@ class Halfspaces:
     def contains(self, z: Float[Tensor, "*batch n"], tolerance: float = 0.0) -> Bool[Tensor, "*batch"]:
         """Is z inside the set, or outside by a distance of at most `tolerance` (units of z)?"""
         return (self.slack(z) >= -tolerance).all(-1)
+
+
+def as_halfspaces(value: Any) -> Halfspaces:
+    """Half-spaces, given as such, as a pair (A, b), or as an object with `halfspaces()`, such as a `FeasibleSet`.
+
+    Raises:
+        InputError: it is none of these.
+    """
+    if isinstance(value, Halfspaces):
+        return value
+    if isinstance(value, tuple | list) and len(value) == 2:
+        return Halfspaces(*value)
+    if not hasattr(value, "halfspaces"):
+        raise InputError("halfspaces", "Halfspaces, a FeasibleSet or a pair (A, b)", type(value).__name__)
+    rows: Any = value
+    return rows.halfspaces()
 
 
 def dot(v: Float[Tensor, "*#batch n"], w: Float[Tensor, "*#batch n"]) -> Float[Tensor, "*#batch"]:

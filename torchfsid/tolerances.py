@@ -5,6 +5,10 @@ from __future__ import annotations
 ROUND_OFF = 8 * 2.0**-52
 """Relative error to allow for in a row's product with a point."""
 
+FLAT = 8 * ROUND_OFF
+"""A set is flat where its half width is below this share of the largest coordinate that it ever had: rows that only
+touch leave a sliver which is no wider."""
+
 PARALLEL_ROWS = 1e-12
 """Angle [rad] below which rows count as parallel."""
 

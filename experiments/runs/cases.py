@@ -60,7 +60,7 @@ def record_cases(config: CasesConfig) -> Recording:
         goals=goals,
         task=controller.task,
         barriers=list(controller.barriers),
-        row_names=[str(j + 1) for j in range(_slots(config))],
+        labels=[f"avoid {j + 1}" for j in range(_slots(config))],
         measurements=(
             sample.measurement
             for sample in closed_loop(controller, goals, start, around, dt=config.dt, samples=samples)

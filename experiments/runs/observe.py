@@ -29,7 +29,7 @@ def observe(observers: Observers, out: Path, track: Track) -> None:
     first, *others = observers.sets
     alongside = {kind: observers.sets[kind] for kind in others}
     with (
-        ResultsWriter(out, recording.robots, observers.sets[first], alongside) as results,
+        ResultsWriter(out, recording.robots, observers.sets[first], alongside, recording.labels) as results,
         Appender(out / "regions.jsonl") as regions,
     ):
         for measurement in track(recording.measurements, "Observing", recording.samples):
@@ -53,7 +53,7 @@ def _regions(recording: Recording, measurement: Measurement, sets: dict[str, Set
             "x": measurement.x[i].tolist(),
             "u": measurement.u[i].tolist(),
             "nominal": nominal[i].tolist(),
-            "active": [recording.row_names[j] for j in active[i].nonzero().flatten().tolist()],
+            "active": [recording.labels[j].removeprefix("avoid ") for j in active[i].nonzero().flatten().tolist()],
             "rows": torch.cat([rows.A[i], rows.b[i].unsqueeze(-1)], dim=-1)[real[i]].tolist(),
             **{kind: _vertices(of_kind[i]) for kind, of_kind in vertices.items()},
         }

@@ -27,7 +27,7 @@ class Recording:
         goals: true goals [m].
         task: the task, also of the observers.
         barriers: the barriers, also of the observers.
-        row_names: for each row of the barriers, the body that it avoids, or else its label.
+        labels: labels of the rows of the barriers.
         measurements: the measurements.
         samples: number of measurements.
     """
@@ -36,7 +36,7 @@ class Recording:
     goals: Float[Tensor, "B 2"]
     task: Task
     barriers: list[Barrier]
-    row_names: list[str]
+    labels: list[str]
     measurements: Iterator[Measurement]
     samples: int
 
@@ -53,13 +53,12 @@ class SimulatedScene:
 
     def recording(self) -> Recording:
         """The recording of the scene's robots."""
-        labels = [label for barrier in self.barriers for label in barrier.labels(self.config.bodies)]
         return Recording(
             robots=[robot.name for robot in self.config.robots],
             goals=_points([robot.goal for robot in self.config.robots]),
             task=self.task,
             barriers=self.barriers,
-            row_names=[label.removeprefix("avoid ") for label in labels],
+            labels=[label for barrier in self.barriers for label in barrier.labels(self.config.bodies)],
             measurements=self.measured.measurements(),
             samples=len(self.measured.t),
         )

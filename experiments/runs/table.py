@@ -75,7 +75,7 @@ def _measure(i: int, config: CasesConfig, results: Results, observers: Observers
             f"{kind}_area_grew": int(of.grew[i]),
         }
     facets = observers.sets["critical_region"].feasible_set.facets()
-    source, rows = facets.source[i][(facets.halfspaces.A[i] != 0).any(-1)], len(observers.recording.row_names)
+    source, rows = facets.source[i][(facets.halfspaces.A[i] != 0).any(-1)], len(observers.recording.labels)
     return row | {
         "facets_of_prior": int((source < 0).sum()),
         "facets_of_inactive_rows": int(((source >= 0) & (source < rows)).sum()),

@@ -36,7 +36,12 @@ class Parser(argparse.ArgumentParser):
 def add_overrides(command: argparse.ArgumentParser) -> None:
     """Add the option `--set a.b=value`, whose values go to `apply_overrides`."""
     command.add_argument(
-        "--set", action="append", default=[], metavar="A.B=VALUE", help="override a key of the configuration"
+        "--set",
+        action="append",
+        default=[],
+        metavar="A.B=VALUE",
+        help="replace a key of the configuration by a YAML value; entries of lists are counted from 0 "
+        "(barriers.0.class_k.gain=2); may be given several times",
     )
 
 

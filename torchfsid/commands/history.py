@@ -1,7 +1,7 @@
 """The course of a run in two thinned files, for pages and viewers.
 
     sets.csv      Theta(t): t, robot, A_i, b, row, row_t
-    motion.csv    what was observed: t, robot, x, y[, z], vx, vy[, vz], active
+    motion.csv    what was observed: t, robot, x, y[, z], vx, vy[, vz][, radius], active
 
 sets.csv has one line for each facet A theta <= b of a set: the name of the constraint that it came from, and the time
 of that measurement [s], empty for the prior. A set is written when it is first known, whenever its volume has changed
@@ -88,8 +88,8 @@ class MotionFile(TableFile):
     """
 
     def __init__(self, path: Path, log: Log, robots: Sequence[str], labels: Sequence[str]):
-        axes = "xyz"[: log.x.shape[-1]]
-        super().__init__(path, ["t", "robot", *axes, *(f"v{axis}" for axis in axes), "active"])
+        axes, sizes = "xyz"[: log.x.shape[-1]], [] if log.radius is None else ["radius"]
+        super().__init__(path, ["t", "robot", *axes, *(f"v{axis}" for axis in axes), *sizes, "active"])
         self._log, self._labels = log, labels
         self._place = {robot: i for i, robot in enumerate(robots)}
         self._stride, self._sample = max(1, math.ceil((len(log.t) - 1) / (MOST_TIMES - 1))), 0
@@ -116,7 +116,8 @@ class MotionFile(TableFile):
             if body in self._place:
                 rows = active[place + self._place[body]].nonzero().flatten().tolist()
             names = "; ".join([self._labels[row] for row in rows])
-            yield [number(log.t[k]), body, *position, *velocity, names]
+            radius = [] if log.radius is None else [number(float(log.radius[j]))]
+            yield [number(log.t[k]), body, *position, *velocity, *radius, names]
 
 
 def _differ(size: tuple[float, float], written: tuple[float, float]) -> bool:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from torchfsid.commands.history import MotionFile
 from torchfsid.commands.judged_bound import JudgedBound
 from torchfsid.commands.narrowing import Narrowing, narrowed
 from torchfsid.commands.results import STATUS_NAMES, ResultsWriter, constraint_name, of_sets, seconds
+from torchfsid.commands.run_in_mcap import RunInMcap
 from torchfsid.config.observe import ObserveConfig
 from torchfsid.errors import FsidError, InconsistentError
 from torchfsid.identification.kkt import CASES
@@ -174,10 +176,16 @@ class Observation:
             needs_more = needs_more & (sets.unexplained == 0)
         return [robot for robot, strained in zip(self.robots, needs_more.tolist(), strict=True) if strained]
 
-    def run(self, out: Path, track: Track = iter) -> None:
+    def run(self, out: Path, track: Track = iter, mcap: Path | None = None, bag: Path | None = None) -> None:
         """Observe the whole log. Write what `results` and `history` describe into the existing folder `out`.
 
         With unknown safety parameters the log is then read again (`second_look`), for the sets of regions.json.
+
+        Args:
+            out: the folder.
+            track: shows how far it has come.
+            mcap: a new file for the run as ROS messages (`run_in_mcap`). None: there is none.
+            bag: a bag whose messages are copied into it. None: none are.
 
         Raises:
             FsidError: no parameter explains a robot, and `on_inconsistent` is `raise`. It names robot and rows.
@@ -188,11 +196,17 @@ class Observation:
         with (
             ResultsWriter(out, self.robots, self.sets, labels=labels, bound=bound, log=told) as results,
             closing(MotionFile(out / "motion.csv", self.log, self.robots, labels)) as motion,
+            nullcontext() if mcap is None else RunInMcap(mcap, self.declared, results.header, bag) as viewed,
         ):
             for samples, estimates in track(self._estimates()):
-                results.write(samples, estimates)
+                lines = results.write(samples, estimates)
                 sets = of_sets(estimates)
                 motion.see(sets)
+                if viewed is not None:
+                    cells, robots = list(csv.reader(lines)), len(self.robots)
+                    for s, t in enumerate(sets.t.tolist()):
+                        shown = sets.sets.select(sets.which[s])
+                        viewed.see(t, shown, sets.status[s].tolist(), cells[s * robots : (s + 1) * robots])
                 cases = sets.kkt.case.view(sets.which.shape)
                 for i, robot in enumerate(self.robots):
                     counts = cases[:, i][sets.informative[:, i]].bincount(minlength=len(CASES)).tolist()
@@ -202,6 +216,8 @@ class Observation:
                     self.sets.look_again(list(self.declared.measurements()))
                 except InconsistentError as error:
                     raise FsidError(self._named(error)) from error
+            if viewed is not None:
+                viewed.finish(self.sets.feasible_set, self.sets.status.tolist())
 
     def _estimates(self) -> Iterator[Estimated]:
         """The samples in blocks, with their estimates."""

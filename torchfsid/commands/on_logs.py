@@ -7,6 +7,8 @@ from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
+from rich.markup import escape
+
 from torchfsid.commands import report
 from torchfsid.commands.check import check
 from torchfsid.commands.command_line import use_one_thread
@@ -14,14 +16,17 @@ from torchfsid.commands.declared_log import AUTO_FACTOR, DeclaredLog
 from torchfsid.commands.figures import draw_observation
 from torchfsid.commands.hypotheses import Hypotheses
 from torchfsid.commands.observe import Observation, times_in
+from torchfsid.commands.page.report import write_pages
+from torchfsid.commands.page.write import PAGE
 from torchfsid.commands.results_folder import ResultsFolder, write_json, write_whole
 from torchfsid.commands.safety_figure import draw_safety
 from torchfsid.commands.terminal import console, status, track
 from torchfsid.config.documents import dump
 from torchfsid.config.models import dump_models
 from torchfsid.config.observe import ObserveConfig
-from torchfsid.errors import FigureError
+from torchfsid.errors import ConfigError, FigureError
 from torchfsid.logs.log import Log
+from torchfsid.logs.mcap import require_new_mcap
 from torchfsid.logs.read import read_log
 
 FILES = ("estimates.csv", "sets.csv", "motion.csv", "regions.json", "regions.png", "regions.pdf")
@@ -33,19 +38,39 @@ UNKNOWN_FILES = ("safety.png", "safety.pdf", "unknown_numbers.json", "task_gain.
 CHECKED = "check.json"
 
 
-def observe_log(path: Path, models: Mapping[str, ObserveConfig], folder: ResultsFolder) -> None:
+def observe_log(
+    path: Path,
+    models: Mapping[str, ObserveConfig],
+    folder: ResultsFolder,
+    with_page: bool = False,
+    mcap: Path | None = None,
+    merge: bool = False,
+) -> None:
     """`torchfsid observe`: infer the sets of a log's robots, under one model or under several hypotheses.
 
     A file that cannot be written or drawn is reported at the end, after everything else is done.
+
+    Args:
+        path: the log.
+        models: the models, by name.
+        folder: the results folder.
+        with_page: write report.html, too.
+        mcap: a new file for the run as ROS messages. None: there is none.
+        merge: copy the messages of the log, a bag, into it.
     """
     use_one_thread()
+    if mcap is not None:
+        _require_viewable(mcap, models, merge)
     log = _read(path, models)
+    if mcap is not None and log.t[0] < 0:
+        raise ConfigError(f"--mcap: ROS has no times below zero, and the log begins at {log.t[0]:g} s")
     run = _ready({name: DeclaredLog(model, log) for name, model in models.items()})
     of_each = run.observations if isinstance(run, Hypotheses) else {"": run}
-    files = [f"{name}/{file}" if name else file for name in of_each for file in ("config.yaml", *FILES, *UNKNOWN_FILES)]
+    of_model = ("config.yaml", *FILES, *UNKNOWN_FILES, *([PAGE] if with_page else []))
+    files = [f"{name}/{file}" if name else file for name in of_each for file in of_model]
     first = next(iter(models.values()))
     bound_file = f"{first.noise.quantity}_bound.json"
-    also = [bound_file, *(["hypotheses.json"] if isinstance(run, Hypotheses) else [])]
+    also = [bound_file, *(["hypotheses.json", *([PAGE] if with_page else [])] if isinstance(run, Hypotheses) else [])]
     folder.claim([*files, *also], dump_models({name: of.stated for name, of in of_each.items()}))
     if run.smallest_bounds is not None:
         found = {"smallest": run.smallest_bounds, "factor": AUTO_FACTOR, "used": run.bound_used}
@@ -63,7 +88,8 @@ def observe_log(path: Path, models: Mapping[str, ObserveConfig], folder: Results
                 if "task.gain" in observation.narrowing.numbers:
                     write_json(out / "task_gain.json", observation.narrowing.numbers["task.gain"].to_json())
             what, total = f"Observing {name}".strip(), observation.samples
-            observation.run(out, partial(track, what=what, total=total, size=times_in))
+            shown = partial(track, what=what, total=total, size=times_in)
+            observation.run(out, shown, mcap, path if merge else None)
             with status("Drawing"):
                 seen = observation.log
                 draw_observation(out, seen.x, seen.seen, seen.bodies)
@@ -71,15 +97,20 @@ def observe_log(path: Path, models: Mapping[str, ObserveConfig], folder: Results
                     draw_safety(out)
         except (OSError, FigureError) as problem:
             problems.append(problem)
+    try:
+        if isinstance(run, Hypotheses):
+            run.write_verdicts(folder.path)
+        if with_page:
+            write_pages(folder.path)
+    except (OSError, FigureError) as problem:
+        problems.append(problem)
     report.print_reading(log.reading, console())
     if isinstance(run, Hypotheses):
-        try:
-            run.write_verdicts(folder.path)
-        except OSError as problem:
-            problems.append(problem)
         report.print_hypotheses(run, folder.path, console())
     else:
         report.print_verdicts(run, folder.path, console())
+    if mcap is not None and mcap.exists():
+        console().print(escape(f"ROS messages: {mcap}"))
     if problems:
         raise problems[0]
 
@@ -100,6 +131,19 @@ def check_log(path: Path, models: Mapping[str, ObserveConfig], folder: ResultsFo
     report.print_reading(log.reading, shown)
     for name, of_model in found.items():
         report.print_check(of_model, name, shown)
+
+
+def _require_viewable(mcap: Path, models: Mapping[str, ObserveConfig], merge: bool) -> None:
+    """Check that these models can be observed into an MCAP file.
+
+    Raises:
+        ConfigError: they cannot.
+    """
+    require_new_mcap(mcap)
+    if len(models) > 1:
+        raise ConfigError("--mcap: one model at a time, and the config has several hypotheses")
+    if merge and next(iter(models.values())).bag is None:
+        raise ConfigError("--merge: copies the messages of a ROS bag, and the config has no section bag")
 
 
 def _read(path: Path, models: Mapping[str, ObserveConfig]) -> Log:

@@ -50,6 +50,9 @@ class ResultsWriter:
     Use it as a context manager. A file that cannot be written (full disk) does not end the run: it stops after its
     last whole sample, and the error is raised on leaving.
 
+    Attributes:
+        header: names of the columns of estimates.csv.
+
     Args:
         out: the folder. It is made if it does not exist.
         robots: names of the inferred robots, in the order of the batch.
@@ -80,7 +83,15 @@ class ResultsWriter:
     def __enter__(self) -> ResultsWriter:
         self.out.mkdir(parents=True, exist_ok=True)
         p = self.observer.feasible_set.dim
-        header = ["t", "robot", "case", "n_active", *set_columns(p), *_indexed("ukf", p), *_indexed("hybrid", p)]
+        self.header = header = [
+            "t",
+            "robot",
+            "case",
+            "n_active",
+            *set_columns(p),
+            *_indexed("ukf", p),
+            *_indexed("hybrid", p),
+        ]
         header += [*([] if self._safety is None else COLUMNS), "status"]
         for prefix in self.others:
             header += [f"{prefix}_{name}" for name in (*set_columns(p), "status")]
@@ -110,8 +121,11 @@ class ResultsWriter:
         measurement: Measurement,
         estimate: Estimate,
         others: Mapping[str, SetEstimate] = MappingProxyType({}),
-    ) -> None:
-        """Write one line per robot for the time of the estimate, or for each time of several."""
+    ) -> list[str]:
+        """Write one line per robot for the time of the estimate, or for each time of several.
+
+        Returns these lines of estimates.csv.
+        """
         sets = of_sets(estimate)
         samples, robots = sets.which.shape
         items, p = samples * robots, self.observer.feasible_set.dim
@@ -134,12 +148,14 @@ class ResultsWriter:
         heads = [f"{t},{name}" for t in map(number, sets.t.tolist()) for name in self._names]
         places = (described[place].text for place in array(sets.which.flatten()).tolist())
         rows = zip(heads, active, places, ukf, hybrid, names, strict=True)
-        self._estimates.write_text("".join([",".join(row) + "\r\n" for row in rows]))
+        lines = [",".join(row) + "\r\n" for row in rows]
+        self._estimates.write_text("".join(lines))
         for s in sorted({0, *_changes(sets.which), samples - 1}):
             at = sets.which[s]
             self._sets.see(
                 float(sets.t[s]), [described[place][:2] for place in at.tolist()], partial(sets.sets.select, at)
             )
+        return lines
 
 
 def of_sets(estimate: Estimate) -> SetEstimates:

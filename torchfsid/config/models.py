@@ -28,7 +28,8 @@ from pydantic import Field, model_validator
 
 from torchfsid.config.barriers import BarrierConfig
 from torchfsid.config.documents import Strict, apply_overrides, dump, read_yaml, to_yaml, validate, wrong
-from torchfsid.config.observe import ObserveConfig, PriorConfig
+from torchfsid.config.observe import ObserveConfig
+from torchfsid.config.observers import PriorConfig
 from torchfsid.config.tasks import TaskConfig
 from torchfsid.errors import ConfigError
 
@@ -77,8 +78,15 @@ def load_models(path: str | Path, overrides: Iterable[str] = ()) -> dict[str, Ob
         ConfigError: see `load`. Also if the file has both `task` and `tasks`, or if it has `tasks` and
             `on_inconsistent` is not `hold`: an empty set refutes a hypothesis, and must not be reset.
     """
-    mapping = apply_overrides(read_yaml(path), overrides)
-    source = str(path)
+    return models_in(apply_overrides(read_yaml(path), overrides), str(path))
+
+
+def models_in(mapping: Mapping[Any, Any], source: str) -> dict[str, ObserveConfig]:
+    """The models in the content of an observe file, by name. `source` names it in messages.
+
+    Raises:
+        ConfigError: see `load_models`.
+    """
     if "tasks" not in mapping:
         return _of_forms("", mapping, source)
     if "task" in mapping:

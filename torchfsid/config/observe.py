@@ -9,13 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import Discriminator, Field, SerializeAsAny, Tag, WrapValidator, model_validator
 
 from torchfsid.config.avoidance import AvoidanceConfig
 from torchfsid.config.bags import BagConfig
 from torchfsid.config.barriers import BarrierConfig
 from torchfsid.config.bodies import UnicycleConfig
 from torchfsid.config.documents import Strict, wrong
+from torchfsid.config.given import GIVEN, GivenBarrier, GivenTask, a_barrier, a_prior, a_task, bounds, is_object
 from torchfsid.config.motion_capture import LogConfig
 from torchfsid.config.observers import AccelerationNoiseConfig, ObservedNoiseConfig, PriorConfig, UkfConfig
 from torchfsid.config.quantities import BodyName, Positive, require_body
@@ -60,6 +61,8 @@ Dynamics = Literal["single_integrator", "double_integrator"]
 class ObserveConfig(Strict):
     """The file of `torchfsid observe`: the declared model, the prior and the bounds on errors.
 
+    In Python, objects may take the place of task, barriers, prior and noise (`config.given`).
+
     Attributes:
         task: the task, whose parameter theta is inferred.
         barriers: the barriers, in the order of their rows.
@@ -84,9 +87,11 @@ class ObserveConfig(Strict):
             `si_to_uni`, since positions then do not follow the commands.
     """
 
-    task: TaskConfig
-    barriers: Annotated[tuple[BarrierConfig, ...], Field(min_length=1)]
-    prior: PriorConfig
+    task: Annotated[SerializeAsAny[TaskConfig], WrapValidator(a_task)]
+    barriers: Annotated[
+        tuple[Annotated[SerializeAsAny[BarrierConfig], WrapValidator(a_barrier)], ...], Field(min_length=1)
+    ]
+    prior: Annotated[SerializeAsAny[PriorConfig], WrapValidator(a_prior)]
     noise: AnyNoiseConfig
     set: Literal["inverse_optimal", "critical_region"] = "inverse_optimal"
     active_tolerance: Positive = 1e-3
@@ -100,6 +105,13 @@ class ObserveConfig(Strict):
     bag: BagConfig | None = None
     log: LogConfig | None = None
     ukf: OptionalUkfConfig = UkfConfig()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _takes_bounds(cls, data: Any) -> Any:
+        if not isinstance(data, Mapping) or not is_object(data.get("noise")):
+            return data
+        return {**data, "noise": bounds(data["noise"], data.get("dynamics"))}
 
     @model_validator(mode="after")
     def _fits_together(self) -> ObserveConfig:
@@ -268,17 +280,22 @@ class ObserveConfig(Strict):
 
 
 def require_one_order(
-    dynamics: Dynamics, task: TaskConfig, barriers: Sequence[BarrierConfig], noise: AnyNoiseConfig
+    dynamics: Dynamics,
+    task: TaskConfig | GivenTask,
+    barriers: Sequence[BarrierConfig | GivenBarrier],
+    noise: AnyNoiseConfig,
 ) -> None:
     """Check, in a validator, that task, barriers and noise are those of robots with these dynamics."""
     second, declared = dynamics == "double_integrator", f"dynamics: {dynamics}"
-    if second and task.kind != "goal":
+    if second and task.kind not in ("goal", GIVEN):
         raise wrong(f"expected 'goal' with {declared}, got {task.kind!r}", "task.kind")
     if second and getattr(task, "law", "proportional") != "proportional":
         raise wrong(f"expected 'proportional' with {declared}", "task.law")
     if not second and task.needs_velocity is not None:
         raise wrong("needs dynamics: double_integrator", f"task.{task.needs_velocity}")
     for i, barrier in enumerate(barriers):
+        if barrier.kind == GIVEN:  # what its controls are is its own affair
+            continue
         if barrier.kind == "avoidance" and barrier.is_second_order != second:
             raise wrong(f"expected {1 + second} with {declared}, got {2 - second}", f"barriers[{i}].order")
         if barrier.is_second_order != second:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
+    from torchfsid.config.given import GivenPrior
     from torchfsid.observers.ukf import ParameterUkf
     from torchfsid.robots.barriers import Barrier
     from torchfsid.robots.bounds import NoiseBound
@@ -222,7 +223,12 @@ class UkfConfig(Strict):
         return tuple((high - low) / math.sqrt(12) for low, high in zip(prior.lower, prior.upper, strict=True))
 
     def build(
-        self, task: Task, barriers: Sequence[Barrier], prior: PriorConfig, robots: int, active_tolerance: float
+        self,
+        task: Task,
+        barriers: Sequence[Barrier],
+        prior: PriorConfig | GivenPrior,
+        robots: int,
+        active_tolerance: float,
     ) -> ParameterUkf:
         """The filter of this number of robots. It starts from the centre of the prior."""
         import torch
@@ -234,7 +240,7 @@ class UkfConfig(Strict):
             task,
             barriers,
             mean=(lower + upper) / 2,
-            spread=torch.tensor(self.spread(prior), dtype=torch.float64).expand(robots, -1),
+            spread=torch.full_like(lower, self.prior_std) if self.prior_std else (upper - lower) / math.sqrt(12),
             position_noise=self.position_noise,
             process_noise=self.process_noise,
             active_tolerance=active_tolerance,

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from torchfsid.config.barriers import BarrierConfig
 from torchfsid.config.documents import Strict
+from torchfsid.config.given import GivenBarrier, GivenTask
 from torchfsid.config.quantities import Path, as_interval
 from torchfsid.config.tasks import TaskConfig
 
@@ -36,7 +37,9 @@ class UnknownNumber(NamedTuple):
         return "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in self.path)[1:]
 
 
-def unknown_numbers(task: TaskConfig, barriers: Sequence[BarrierConfig]) -> list[UnknownNumber]:
+def unknown_numbers(
+    task: TaskConfig | GivenTask, barriers: Sequence[BarrierConfig | GivenBarrier]
+) -> list[UnknownNumber]:
     """The numbers of a task and of barriers that are given as [low, high] and can be narrowed."""
     sections = [(("task",), task), *((("barriers", i), barrier) for i, barrier in enumerate(barriers))]
     return [

@@ -25,7 +25,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -39,6 +39,7 @@ from torchfsid.identification.critical_region import region_of
 from torchfsid.identification.inverse_optimal import normals_of, per_row, set_around, without_direction
 from torchfsid.identification.kkt import KktSolution, solve_unit
 from torchfsid.kernels import evidence as kernel
+from torchfsid.robots.arguments import require_barriers, require_choice, require_task
 from torchfsid.robots.barriers import Barrier, controller_failed, possible_rows, row_errors
 from torchfsid.robots.bounds import ErrorBounds, NoiseBound, RowErrors
 from torchfsid.robots.measurement import Measurement
@@ -77,8 +78,11 @@ class ObservationModel:
     active_tolerance: float = ACTIVE_TOLERANCE
 
     def __post_init__(self) -> None:
-        if self.kind == "inverse_optimal" and self.noise is None:
-            raise InputError("noise", "a NoiseBound, since the set is inverse_optimal", None)
+        require_task(self.task)
+        require_barriers(self.barriers)
+        require_choice("kind", self.kind, get_args(SetKind))
+        if not isinstance(self.noise, NoiseBound) and (self.noise is not None or self.kind == "inverse_optimal"):
+            raise InputError("noise", "a NoiseBound, e.g. NoiseBound(velocity=0.02)", repr(self.noise))
         for barrier in self.barriers:
             if not callable(barrier):
                 raise InputError("barriers", "barriers with known parameters (or a SafetyObserver)", barrier)

@@ -28,7 +28,8 @@ from torchfsid.halfspaces import Halfspaces
 from torchfsid.identification.by_robot import by_robot
 from torchfsid.identification.evidence import Evidence, ObservationModel, evidence
 from torchfsid.identification.inverse_optimal import per_row
-from torchfsid.outcome import Outcome
+from torchfsid.outcome import Status
+from torchfsid.robots.arguments import require_barriers, require_task
 from torchfsid.robots.avoidance_within import AvoidanceWithin, SafetyRows
 from torchfsid.robots.barriers import Barrier
 from torchfsid.robots.bounds import ErrorBounds, NoiseBound
@@ -148,6 +149,10 @@ class LearningModel:
     active_tolerance: float = ACTIVE_TOLERANCE
 
     def __post_init__(self) -> None:
+        require_task(self.task)
+        require_barriers(self.barriers)
+        if not isinstance(self.noise, NoiseBound):
+            raise InputError("noise", "a bound, e.g. NoiseBound(velocity=0.02)", repr(self.noise))
         unknown = [barrier for barrier in self.barriers if isinstance(barrier, UnknownAvoidance)]
         if len(unknown) != 1:
             raise InputError("barriers", "exactly one UnknownAvoidance", len(unknown))
@@ -238,5 +243,5 @@ def _must_be_active(
         left = (~explained).nonzero().flatten()
         if len(left):
             sets = theta.select(robot[left]).intersect(Halfspaces(omega.A[left], omega.b[left]))
-            must[items[left], rows[left]] = sets.outcome == Outcome.EMPTY
+            must[items[left], rows[left]] = sets.outcome == Status.EMPTY
     return must

@@ -27,7 +27,7 @@ from torch import Tensor
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.identification.kkt import outward_normals
 from torchfsid.kernels.saturation import AROUND
-from torchfsid.outcome import Outcome
+from torchfsid.outcome import Status
 from torchfsid.robots.tasks import Saturation
 from torchfsid.sets.polygon import Polygon
 from torchfsid.tolerances import ANGLE_TOLERANCE, CRITICAL_NORMALS, ON_LIMIT
@@ -74,7 +74,7 @@ def _unclipped(
     limits = torch.minimum(b.new_tensor(saturation.limits), 2 * farthest.detach())
     no_source = torch.zeros_like(b, dtype=torch.long)
     cut = Polygon.from_box(-limits, limits).clip(own, b, torch.zeros_like(b), no_source, admissible.rows + 4)
-    vertices, within = cut.body.vertices, (cut.outcome != Outcome.EMPTY).unsqueeze(-1)
+    vertices, within = cut.body.vertices, (cut.outcome != Status.EMPTY).unsqueeze(-1)
     if by_norm:
         outward, touched = _arcs(admissible, limits[:, :1], around)
         within = within & (vertices.detach().norm(dim=-1) <= limits[:, :1])

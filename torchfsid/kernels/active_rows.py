@@ -31,13 +31,13 @@ import numpy as np
 
 from torchfsid.kernels.compiled import item
 from torchfsid.kernels.linear import invert, on_rows, orthogonalise, solve_upper
-from torchfsid.outcome import ProgrammeStatus
+from torchfsid.outcome import Status
 from torchfsid.tolerances import CLEARLY_EMPTY, MOST_ROUNDS, ROUND_OFF
 
 FACING = 0.71
 """Cosine of the angle up to which a row can stand in for a side of the simplex that a search begins with."""
 
-OK, EMPTY, UNSOLVED = int(ProgrammeStatus.OK), int(ProgrammeStatus.EMPTY), int(ProgrammeStatus.UNSOLVED)
+OK, EMPTY, UNSOLVED = int(Status.OK), int(Status.EMPTY), int(Status.UNSOLVED)
 
 
 @item

@@ -14,9 +14,9 @@ import numpy as np
 
 from torchfsid.kernels.compiled import item
 from torchfsid.kernels.linear import dot
-from torchfsid.outcome import ProgrammeStatus
+from torchfsid.outcome import Status
 
-OK, EMPTY, UNDEFINED = int(ProgrammeStatus.OK), int(ProgrammeStatus.EMPTY), int(ProgrammeStatus.UNDEFINED)
+OK, EMPTY, UNDEFINED = int(Status.OK), int(Status.EMPTY), int(Status.UNDEFINED)
 
 SHORT, LONG = 1e-100, 1e100
 """Largest numbers that need no scaling."""

@@ -16,9 +16,9 @@ import numpy as np
 from torchfsid.kernels.compiled import item, launcher
 from torchfsid.kernels.frame import cholesky, scale_of, unwhiten, whiten
 from torchfsid.kernels.linear import solve_rows
-from torchfsid.outcome import ProgrammeStatus
+from torchfsid.outcome import Status
 
-OK = int(ProgrammeStatus.OK)
+OK = int(Status.OK)
 
 
 @item

@@ -14,9 +14,9 @@ from typing import no_type_check
 import numpy as np
 
 from torchfsid.kernels.compiled import item, launcher
-from torchfsid.outcome import FilterStatus
+from torchfsid.outcome import Status
 
-OK, PREDICTED = int(FilterStatus.OK), int(FilterStatus.PREDICTED)
+OK, PREDICTED = int(Status.OK), int(Status.PREDICTED)
 
 
 @item
@@ -131,7 +131,7 @@ def advance(
         drift: (S, B, p), variances of w_theta.
         thetas: (S, B, p), to be filled with theta after each sample.
         covariances: (S, B, p, p), to be filled with its covariance.
-        status: (S, B), to be filled with a `FilterStatus`.
+        status: (S, B), to be filled with a `Status`.
 
     Returns:
         The sample at which each robot's filter failed, S if none. Its state is then that before the sample.

@@ -21,10 +21,10 @@ import numpy as np
 
 from torchfsid.kernels.compiled import item, item_of_ordered, launcher
 from torchfsid.kernels.ring import after_in, area_of, before_in, copy_ring, merge_ring
-from torchfsid.outcome import Outcome
+from torchfsid.outcome import Status
 from torchfsid.tolerances import ROUND_OFF
 
-NONEMPTY, UNDECIDED, EMPTY = int(Outcome.NONEMPTY), int(Outcome.UNDECIDED), int(Outcome.EMPTY)
+OK, UNDECIDED, EMPTY = int(Status.OK), int(Status.UNDECIDED), int(Status.EMPTY)
 
 
 @item_of_ordered
@@ -110,7 +110,7 @@ def cut_ring(ring, edge, n, lines, first_row, reach, tolerance, cutting, cuts, o
 
     Returns (n, outcome, whether the ring is smaller, and three lines that contradict each other if it is EMPTY).
     """
-    outcome, shrunk = NONEMPTY, False
+    outcome, shrunk = OK, False
     for s in range(cuts):
         row = cutting[s]
         line, slack, inner = first_row + row, tolerance[row], 0

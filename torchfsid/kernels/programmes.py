@@ -21,12 +21,12 @@ from torchfsid.kernels.active_rows import excess, inscribed_rows, nearest_rows
 from torchfsid.kernels.compiled import item, launcher
 from torchfsid.kernels.frame import cholesky, distance, from_frame, to_frame, unwhiten
 from torchfsid.kernels.linear import dot, solve_rows
-from torchfsid.outcome import ProgrammeStatus
+from torchfsid.outcome import Status
 from torchfsid.tolerances import ROUND_OFF, VERIFIED
 
-OK, EMPTY, UNBOUNDED = int(ProgrammeStatus.OK), int(ProgrammeStatus.EMPTY), int(ProgrammeStatus.UNBOUNDED)
-DEGENERATE, UNDEFINED = int(ProgrammeStatus.DEGENERATE), int(ProgrammeStatus.UNDEFINED)
-UNSOLVED = int(ProgrammeStatus.UNSOLVED)
+OK, EMPTY, UNBOUNDED = int(Status.OK), int(Status.EMPTY), int(Status.UNBOUNDED)
+DEGENERATE, UNDEFINED = int(Status.DEGENERATE), int(Status.UNDEFINED)
+UNSOLVED = int(Status.UNSOLVED)
 IMPOSSIBLE, BOUNDLESS = -1, -2
 """EMPTY by a row 0.z <= b < 0, and UNBOUNDED for want of a largest ball: there is no finite radius."""
 

@@ -17,10 +17,10 @@ from torchfsid.kernels.active_rows import nearest_rows
 from torchfsid.kernels.compiled import item, launcher
 from torchfsid.kernels.frame import to_frame
 from torchfsid.kernels.programmes import finish_nearest
-from torchfsid.outcome import ProgrammeStatus
+from torchfsid.outcome import Status
 from torchfsid.tolerances import ROUND_OFF
 
-OK = int(ProgrammeStatus.OK)
+OK = int(Status.OK)
 
 
 @item

@@ -48,7 +48,7 @@ def read_bag(path: str | Path, bag: BagConfig, with_headings: bool = False) -> L
     """
     source = str(path)
     content = _read(Path(path), bag)
-    content.require_one_frame(bag)
+    frame = content.common_frame(bag)
     motions = {origin: content.motion(origin) for origin, _ in bag.origins}
     accelerations = {body: content.motion(f"topic {topic!r}") for topic, body in bag.accelerations.items()}
     start = start_of(int(motion.stamps[0]) for motion in [*motions.values(), *accelerations.values()])
@@ -70,6 +70,7 @@ def read_bag(path: str | Path, bag: BagConfig, with_headings: bool = False) -> L
     clock = None if bag.rate is None else _clock(tracks[0].stamps, bag.rate)
     radius = None if bag.radius is None else np.array([bag.radius[track.body] for track in tracks])
     log = log_of_tracks(source, tracks, clock, radius)
+    log = replace(log, frame=frame)
     return replace(log, reading=Reading(time_origin=start / 1_000_000_000)) if start else log
 
 
@@ -89,8 +90,12 @@ class _Content:
     transforms: Transforms | None
     names: dict[str, str]
 
-    def require_one_frame(self, bag: BagConfig) -> None:
-        """Check that positions and accelerations are in one frame. With a fixed frame, those of one topic."""
+    def common_frame(self, bag: BagConfig) -> str:
+        """The frame of all positions and accelerations: the fixed frame, if there is one.
+
+        Raises:
+            LogError: there are several, or with a fixed frame those of one topic are in several.
+        """
         origins = [origin for origin, _ in bag.origins]
         for of_one in [[origin] for origin in origins] if self.transforms else [origins]:
             frames = {sample.frame: origin for origin in of_one for sample in self.samples[origin]}
@@ -105,6 +110,7 @@ class _Content:
                 if sample.frame != common:
                     what = f"accelerations in the frame {sample.frame!r}, not {common!r}"
                     raise LogError(f"{self.source}: topic {topic!r}: {what}")
+        return common
 
     def motion(self, origin: str) -> Motion:
         """The samples from one origin in the order of time, in the fixed frame if there is one."""

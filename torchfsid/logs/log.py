@@ -49,6 +49,7 @@ class Log:
         heading: headings of unicycles [rad], or None if they were not asked for.
         oriented: the body is there at t and its heading is known. None if headings were not asked for.
         reading: what was found while the log was read.
+        frame: name of the frame of the positions, if the log has one.
     """
 
     source: str
@@ -69,6 +70,7 @@ class Log:
     heading: Float[np.ndarray, "times bodies"] | None = None
     oriented: Bool[np.ndarray, "times bodies"] | None = None
     reading: Reading = field(default_factory=Reading)
+    frame: str | None = None
 
     @property
     def with_headings(self) -> tuple[str, ...]:

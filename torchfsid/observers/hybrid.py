@@ -28,10 +28,10 @@ from torch import Tensor
 from torchfsid.errors import InputError, SolverError
 from torchfsid.observers.blocks import one_by_one
 from torchfsid.observers.safety import SafetyObserver, SetObserver
-from torchfsid.observers.set_membership import SetEstimate, SetEstimates
+from torchfsid.observers.set_membership import SetEstimate, SetEstimates, rounded
 from torchfsid.observers.ukf import ParameterUkf
 from torchfsid.observers.ukf_estimates import UkfEstimate, UkfEstimates
-from torchfsid.outcome import HybridStatus
+from torchfsid.outcome import Status
 from torchfsid.robots.measurement import Measurement
 from torchfsid.sets.feasible_set import FeasibleSet
 
@@ -48,7 +48,7 @@ class HybridEstimate:
         theta: the filter's estimate projected onto Theta(t).
         set_estimate: the estimate of the set-membership observer.
         ukf_estimate: the estimate of the filter, with feedback after its mean was replaced.
-        status: a `HybridStatus` per robot.
+        status: a `Status` per robot.
     """
 
     t: float
@@ -56,6 +56,14 @@ class HybridEstimate:
     set_estimate: SetEstimate
     ukf_estimate: UkfEstimate
     status: Int[Tensor, "B"]
+
+    @property
+    def status_names(self) -> list[str]:
+        """The statuses in words, one per robot."""
+        return Status.names(self.status)
+
+    def __repr__(self) -> str:
+        return f"HybridEstimate(t={self.t:g}, theta={rounded(self.theta)}, {self.set_estimate!r})"
 
 
 @dataclass(frozen=True)
@@ -145,7 +153,7 @@ class HybridObserver:
 def _into(
     sets: FeasibleSet, theta: Float[Tensor, "B p"], covariance: Float[Tensor, "B p p"]
 ) -> tuple[Float[Tensor, "B p"], Int[Tensor, "B"]]:
-    """The filters' estimates projected onto the sets, and a `HybridStatus` for each."""
+    """The filters' estimates projected onto the sets, and a `Status` for each."""
     metric, usable = _information_metric(covariance)
     known = theta.isfinite().all(-1)
     start = torch.where(known.unsqueeze(-1), theta, 0.0)
@@ -153,11 +161,11 @@ def _into(
         theta = sets.project(start, metric)
     except SolverError:
         theta = torch.full_like(start, torch.nan)
-    status = torch.where(usable, HybridStatus.OK, HybridStatus.EUCLIDEAN)
+    status = torch.where(usable, Status.OK, Status.EUCLIDEAN)
     found = known & theta.isfinite().all(-1) & sets.contains(theta)
     if not bool(found.all()):
         theta = torch.where(found.unsqueeze(-1), theta, sets.centroid())
-        status = torch.where(found, status, HybridStatus.CENTROID)
+        status = torch.where(found, status, Status.CENTROID)
     return theta, status
 
 

@@ -19,14 +19,21 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.identification.safety_parameters import LearningModel, Possible, Reading
 from torchfsid.observers.blocks import one_by_one
 from torchfsid.observers.safety_sets import Refutation, SafetySets
 from torchfsid.observers.second_look import MOST_CELLS
-from torchfsid.observers.set_membership import Event, OnInconsistent, SetEstimate, SetEstimates, SetMembershipObserver
+from torchfsid.observers.set_membership import (
+    Event,
+    OnInconsistent,
+    SetEstimate,
+    SetEstimates,
+    SetMembershipObserver,
+    require_prior,
+)
 from torchfsid.outcome import Status
+from torchfsid.robots.arguments import require_task
 from torchfsid.robots.barriers import Barrier
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.measurement import Measurement
@@ -72,9 +79,9 @@ class SafetyObserver:
     _unread: list[Measurement] = field(init=False, default_factory=list)
 
     def __post_init__(self) -> None:
-        p, shape = len(self.task.parameter_names), self.prior.batch_shape
-        if len(shape) != 1 or self.prior.dim != p:
-            raise InputError("prior", f"a batch (B,) of sets over the task's {p} parameters", (*shape, self.prior.dim))
+        require_task(self.task)
+        require_prior("prior", self.prior, self.task)
+        shape = self.prior.batch_shape
         self.model = LearningModel(self.task, self.barriers, self.noise, self.active_tolerance)
         robots, unknown = torch.arange(shape[0]), self.model.unknown
         alone = Possible(self.prior, unknown.prior(shape[0]), robots)

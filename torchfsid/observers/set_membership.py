@@ -20,7 +20,7 @@ from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Literal
+from typing import Any, Literal, get_args
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -33,6 +33,7 @@ from torchfsid.identification.windows import Windows
 from torchfsid.observers.blocks import Course, depends_on_theta, joined, one_by_one, times_of
 from torchfsid.observers.outliers import SetAside, possible, set_aside
 from torchfsid.outcome import Status
+from torchfsid.robots.arguments import require_choice, require_task
 from torchfsid.robots.barriers import Barrier
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.measurement import Measurement
@@ -41,6 +42,9 @@ from torchfsid.sets.feasible_set import FeasibleSet
 from torchfsid.tolerances import ACTIVE_TOLERANCE
 
 OnInconsistent = Literal["hold", "reset", "raise"]
+
+MOST_SHOWN = 8
+"""Robots in the text of an estimate."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +81,14 @@ class SetEstimate:
     informative: Bool[Tensor, "B"]
     status: Int[Tensor, "B"]
     safety: FeasibleSet | None = None
+
+    @property
+    def status_names(self) -> list[str]:
+        """The statuses in words, one per robot."""
+        return Status.names(self.status)
+
+    def __repr__(self) -> str:
+        return f"SetEstimate(t={self.t:g}, sets={self.feasible_set!r}, status={Status.names(self.status[:MOST_SHOWN])})"
 
     @property
     def kkt(self) -> KktSolution:
@@ -190,10 +202,10 @@ class SetMembershipObserver:
     _below: tuple[FeasibleSet, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        p = len(self.task.parameter_names)
-        if len(self.feasible_set.batch_shape) != 1 or self.feasible_set.dim != p:
-            actual = (*self.feasible_set.batch_shape, self.feasible_set.dim)
-            raise InputError("feasible_set", f"a batch (B,) of sets over the task's {p} parameters", actual)
+        require_task(self.task)
+        require_prior("feasible_set", self.feasible_set, self.task)
+        require_choice("on_inconsistent", self.on_inconsistent, get_args(OnInconsistent))
+        p = self.feasible_set.dim
         self.model = ObservationModel(self.task, self.barriers, self.kind, self.noise, self.active_tolerance)
         if self.compiled and p != 2:
             raise InputError("compiled", "None or False unless theta is planar", True)
@@ -303,6 +315,25 @@ class SetMembershipObserver:
             s, robot = lost.nonzero()[0].tolist()
             raise InconsistentError(robot, float(times[s]), course.proofs[s, robot])
         return status
+
+
+def rounded(theta: Float[Tensor, "B p"]) -> list[list[float]]:
+    """The first parameters of a batch with four digits, for a line of text."""
+    return [[float(f"{value:.4g}") for value in row] for row in theta[:MOST_SHOWN].tolist()]
+
+
+def require_prior(name: str, prior: Any, task: Task) -> None:
+    """Check the prior of a batch of robots.
+
+    Raises:
+        InputError: it is no batch (B,) of sets over the task's parameters.
+    """
+    p = len(task.parameter_names)
+    expected = f"a FeasibleSet for each robot, a batch (B,) over the task's {p} parameters"
+    if not isinstance(prior, FeasibleSet):
+        raise InputError(name, f"{expected}, e.g. FeasibleSet.from_box(lower, upper) of (B, {p})", repr(prior))
+    if len(prior.batch_shape) != 1 or prior.dim != p:
+        raise InputError(name, expected, f"batch {tuple(prior.batch_shape)} over {prior.dim}")
 
 
 def contradicting(sets: FeasibleSet, item: int) -> tuple[tuple[float, int], ...]:

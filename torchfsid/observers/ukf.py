@@ -39,7 +39,8 @@ from torchfsid.observers.blocks import times_of
 from torchfsid.observers.definite import FLOOR, make_definite
 from torchfsid.observers.motions import Array, Motion, Motions, ObservedMotion, read_motions
 from torchfsid.observers.ukf_estimates import UkfEstimate, UkfEstimates
-from torchfsid.outcome import FilterStatus
+from torchfsid.outcome import Status
+from torchfsid.robots.arguments import require_barriers, require_task
 from torchfsid.robots.barriers import Barrier
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.tasks import Task
@@ -98,6 +99,8 @@ class ParameterUkf:
     filters: list[UnscentedKalmanFilter | None] = field(init=False)
 
     def __post_init__(self) -> None:
+        require_task(self.task)
+        require_barriers(self.barriers)
         p = len(self.task.parameter_names)
         if self.mean.ndim != 2 or self.mean.shape[-1] != p or not bool(self.mean.isfinite().all()):
             raise InputError("mean", f"finite means (B, {p})", self.mean)
@@ -260,7 +263,7 @@ class ParameterUkf:
                     kalman.x = np.concatenate([kalman.x[:n] + kalman.P[:n, n:] @ change, corrected[i]])
         self._theta = corrected
 
-    def _update_robot(self, i: int, dt: float, position: Array | None) -> FilterStatus:
+    def _update_robot(self, i: int, dt: float, position: Array | None) -> Status:
         """Bring robot i's filter, mean and covariance to the time of the measurement."""
         kalman, motion = self.filters[i], self._motions[i]
         (walk,), drift = self._noises(np.array([dt]))
@@ -279,18 +282,18 @@ class ParameterUkf:
                 if not (np.isfinite(kalman.x).all() and np.isfinite(kalman.P).all()):
                     return self._restart(i, position)
                 self._theta[i], self._covariance[i] = kalman.x[n:], kalman.P[n:, n:]
-                return FilterStatus.REPAIRED if repaired else FilterStatus.OK
+                return Status.REPAIRED if repaired else Status.OK
         if dt > 0:
             self._covariance[i] += np.diag(drift)
         self.filters[i] = None if position is None else self._start(i, position)
-        return FilterStatus.PREDICTED
+        return Status.PREDICTED
 
-    def _restart(self, i: int, position: Array) -> FilterStatus:
+    def _restart(self, i: int, position: Array) -> Status:
         """Start robot i's filter again from its prior."""
         mean, covariance = self._prior
         self._theta[i], self._covariance[i] = mean[i], covariance[i]
         self.filters[i] = self._start(i, position)
-        return FilterStatus.FAILED
+        return Status.FAILED
 
     def _start(self, i: int, position: Array) -> UnscentedKalmanFilter:
         """A filter at a first measured position, with the current mean and covariance of theta."""

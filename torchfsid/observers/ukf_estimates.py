@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchfsid.outcome import Status
+
 
 @dataclass(frozen=True)
 class UkfEstimate:
@@ -16,13 +18,18 @@ class UkfEstimate:
         t: time [s].
         theta: the mean of theta.
         covariance: the covariance of theta.
-        status: a `FilterStatus` per robot, for this measurement alone.
+        status: a `Status` per robot, for this measurement alone.
     """
 
     t: float
     theta: Float[Tensor, "B p"]
     covariance: Float[Tensor, "B p p"]
     status: Int[Tensor, "B"]
+
+    @property
+    def status_names(self) -> list[str]:
+        """The statuses in words, one per robot."""
+        return Status.names(self.status)
 
 
 @dataclass(frozen=True)

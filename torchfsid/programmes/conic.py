@@ -23,7 +23,7 @@ from torch import Tensor
 
 from torchfsid.errors import InputError, SolverError
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.outcome import ProgrammeStatus
+from torchfsid.outcome import Status
 from torchfsid.programmes import differentiable as programmes
 from torchfsid.programmes.differentiable import InscribedBall, NearestPoint, broadcast, times
 
@@ -47,7 +47,7 @@ def nearest_point(halfspaces: Halfspaces, point: Tensor, metric: Tensor | None =
     halfspaces, y, metric = broadcast(halfspaces, point, metric)
     with torch.no_grad():
         exact, status = programmes.nearest_point(halfspaces, y, metric)
-    ok, p = status == ProgrammeStatus.OK, halfspaces.dim
+    ok, p = status == Status.OK, halfspaces.dim
     A, offsets = halfspaces.A, halfspaces.b - times(halfspaces.A, y)
     root = None
     if metric is not None:
@@ -79,7 +79,7 @@ def inscribed_ball(halfspaces: Halfspaces) -> InscribedBall:
         centre, radius, status = programmes.inscribed_ball(halfspaces)
         solvable = centre.isfinite().all(-1) & radius.isfinite()
         origin = torch.where(solvable.unsqueeze(-1), centre, 0.0)
-        size = torch.where(solvable & (status != ProgrammeStatus.DEGENERATE), radius.abs(), 1.0).unsqueeze(-1)
+        size = torch.where(solvable & (status != Status.DEGENERATE), radius.abs(), 1.0).unsqueeze(-1)
     unit = halfspaces.where(solvable.unsqueeze(-1).expand_as(halfspaces.b)).normalised()
     distance = (unit.b - times(unit.A, origin)) / size
     near = Halfspaces(unit.A, distance).where(distance <= FAR)
@@ -171,7 +171,7 @@ class ActiveRowsSolver(SolverInterface):
         y = -torch.linalg.solve(metric, times(Z.mT, times(H, x0) + q))
         v, mu, rows, filled, status = programmes.nearest(Halfspaces(N @ Z, o - times(N, x0)), y, metric)
         # NaN is filled in only at the end: earlier it would spoil shared gradients.
-        solved = (status == ProgrammeStatus.OK).unsqueeze(-1)
+        solved = (status == Status.OK).unsqueeze(-1)
         x = x0 + times(Z, torch.where(solved, v, 0.0))
         multipliers = torch.zeros_like(o).scatter_add(-1, rows, torch.where(filled & solved, mu, 0.0))
         pull = times(H, x) + q + times(N.mT, multipliers)

@@ -26,24 +26,34 @@ from torch import Tensor
 
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, lengths
-from torchfsid.outcome import ProgrammeStatus
+from torchfsid.outcome import Status
 from torchfsid.programmes import exact
 from torchfsid.programmes.exact import simplex_around
 
 
 class NearestPoint(NamedTuple):
-    """The nearest point, in the dtype of the given point, and a `ProgrammeStatus` for each item."""
+    """The nearest point, in the dtype of the given point, and a `Status` for each item."""
 
     point: Float[Tensor, "*batch p"]
     status: Int[Tensor, "*batch"]
 
+    @property
+    def status_names(self) -> Any:
+        """The statuses in words, nested like the batch; one word for a single item."""
+        return Status.names(self.status)
+
 
 class InscribedBall(NamedTuple):
-    """Centre and radius of the largest inscribed ball, and a `ProgrammeStatus` for each item."""
+    """Centre and radius of the largest inscribed ball, and a `Status` for each item."""
 
     centre: Float[Tensor, "*batch p"]
     radius: Float[Tensor, "*batch"]
     status: Int[Tensor, "*batch"]
+
+    @property
+    def status_names(self) -> Any:
+        """The statuses in words, nested like the batch; one word for a single item."""
+        return Status.names(self.status)
 
 
 def nearest_point(
@@ -153,7 +163,7 @@ class _NearestPoint(torch.autograd.Function):
         if metric is None and _first_derivatives_suffice():
             saved = A, rows, filled, mu, z, status
             return *on_arrays(exact.nearest_point_vjp, *saved, grad_z, grad_mu), None
-        ok = status.unsqueeze(-1) == ProgrammeStatus.OK
+        ok = status.unsqueeze(-1) == Status.OK
         z, metric = torch.where(ok, z, 0.0), _definite(metric, ok)
         N, index = _taken(A, rows)
         u, v = _SolveActive.apply(N, filled, torch.where(ok, grad_z, 0.0), grad_mu, metric)  # type: ignore[misc]
@@ -166,7 +176,7 @@ class _NearestPoint(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, dA: Any, db: Any, dy: Any, dmetric: Any) -> tuple[Tensor | None, ...]:
         A, y, metric, z, mu, rows, filled, status = ctx.saved_tensors
-        ok = status.unsqueeze(-1) == ProgrammeStatus.OK
+        ok = status.unsqueeze(-1) == Status.OK
         z, metric = torch.where(ok, z, 0.0), _definite(metric, ok)
         N, index = _taken(A, rows)
         pull, offsets = torch.zeros_like(z), torch.zeros_like(z)

@@ -31,7 +31,7 @@ def nearest_point(A: Reals, b: Reals, y: Reals, metric: Reals | None = None) -> 
 
     Returns:
         The point (B, p), the multipliers of its active rows (B, p), the indices of these rows (B, p), a mask of the
-        places that are filled, the first ones (B, p), and a `ProgrammeStatus` (B,).
+        places that are filled, the first ones (B, p), and a `Status` (B,).
     """
     B, _, p = A.shape
     z, mu, rows = np.zeros((B, p)), np.zeros((B, p)), np.zeros((B, p), dtype=np.int64)
@@ -51,7 +51,7 @@ def inscribed_ball(A: Reals, b: Reals) -> tuple:
         b: (B, m).
 
     Returns:
-        The centre (B, p), the radius (B,), the rows that decide them (B, p + 1), and a `ProgrammeStatus` (B,). An index
+        The centre (B, p), the radius (B,), the rows that decide them (B, p + 1), and a `Status` (B,). An index
         of m or more stands for no row: the set is open there.
     """
     B, _, p = A.shape

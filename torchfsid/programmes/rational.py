@@ -25,7 +25,7 @@ def nearest_point(A: Array, b: Array, y: Array, H: Array, z: Array, mu: Array, r
     """Find the nearest point of one item. Fills `z`, `mu`, `rows` and `filled`.
 
     Returns:
-        Its `ProgrammeStatus`.
+        Its `Status`.
     """
     try:
         status = _nearest_point(A, b, y, H, z, mu, rows, filled)
@@ -64,7 +64,7 @@ def inscribed_ball(A: Array, b: Array, simplex: Array, centre: Array, rows: Arra
     """Find the largest ball of one item. Fills `centre` and `rows`.
 
     Returns:
-        The radius and the `ProgrammeStatus`.
+        The radius and the `Status`.
     """
     try:
         return _inscribed_ball(A, b, simplex, centre, rows)

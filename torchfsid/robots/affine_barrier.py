@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import get_args
 
 import torch
 from jaxtyping import Float
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces
+from torchfsid.robots.arguments import require_choice, require_names
 from torchfsid.robots.avoidance import NeighbourVelocity
 from torchfsid.robots.bounds import ErrorBounds, RowErrors
 from torchfsid.robots.measurement import Measurement
@@ -21,13 +23,26 @@ from torchfsid.robots.measurement import Measurement
 class AffineBarrier:
     """Any rows A u <= b, with A (m, n) and b (m,) given as tensors or as functions of the measurement.
 
-    Rows given as tensors are constant. About functions, only what the other arguments declare is known. A sample is
-    skipped if something unknown could matter for it.
+    Rows given as tensors are constant. A function sees the batch of robots: for a measurement with x (B, n) it returns
+    A (B, m, n), or b (B, m). About functions, only what the other arguments declare is known. A sample is skipped if
+    something unknown could matter for it.
+
+    One row for a disc of radius r around the origin, h = |x|^2 - r^2 and -2 x.u <= gain h, with its errors where
+    positions are wrong by at most e = `bounds.position`: the direction by asin(e / |x|), and the slack by the change of
+    the boundary gain h / (2 |x|), which grows with |x|, and by the turn of the row:
+
+        def row_errors(measurement, bounds):                                    # (B, m) each, here m = 1
+            x, e, speed = measurement.x.norm(dim=-1), bounds.position, measurement.u.norm(dim=-1)
+            angle = (e / x).clamp(max=1.0).arcsin()
+            nearest = (x - e).clamp(min=1e-9)
+            slack = boundary(x + e) - boundary(nearest) + angle * speed         # boundary(s) = gain (s^2 - r^2) / (2 s)
+            return RowErrors(angle.unsqueeze(-1), slack.unsqueeze(-1))
 
     Attributes:
         names: a name for each row.
         soft: the controller may violate the rows.
-        row_errors: bounds on the errors of the rows. Functions need it if positions have errors.
+        row_errors: a function (measurement, `ErrorBounds`) -> `RowErrors` that bounds the errors of the rows. It is
+            needed only for functions, and if positions have errors.
         depends_on_bodies: False if the functions use the robot's own state only. Then no body without a slot has a
             row, and neighbours' velocities do not matter.
         neighbour_velocity: see `Barrier`; None if unknown.
@@ -44,6 +59,9 @@ class AffineBarrier:
     left_out: Callable[[Measurement], Float[Tensor, "*batch"]] | None = None
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "names", require_names("names", self.names))
+        if self.neighbour_velocity is not None:
+            require_choice("neighbour_velocity", self.neighbour_velocity, get_args(NeighbourVelocity))
         if not (callable(self.A) or callable(self.b)):
             object.__setattr__(self, "depends_on_bodies", False)
         if not self.depends_on_bodies:
@@ -62,7 +80,8 @@ class AffineBarrier:
         if self.row_errors is not None:
             return self.row_errors(measurement, bounds)
         if (callable(self.A) or callable(self.b)) and not bounds.exact:
-            raise InputError("AffineBarrier.row_errors", "how far the rows may be off where bodies may be", None)
+            expected = "a function that bounds the errors of the rows, since positions have errors (see AffineBarrier)"
+            raise InputError("AffineBarrier.row_errors", expected, None)
         return RowErrors.none(self(measurement).b)
 
     def slack_left_out(self, measurement: Measurement) -> Float[Tensor, "*batch"]:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from jaxtyping import Bool, Float
@@ -23,6 +23,7 @@ from torch import Tensor
 
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, dot
+from torchfsid.robots.arguments import require_choice, require_numbers
 from torchfsid.robots.bounds import ErrorBounds, RowErrors
 from torchfsid.robots.measurement import Measurement
 from torchfsid.tolerances import ROUND_OFF
@@ -72,8 +73,8 @@ class ClassK:
     power: float = 1.0
 
     def __post_init__(self) -> None:
-        if not (bool((torch.as_tensor(self.gain) > 0).all()) and self.power > 0):
-            raise InputError("class_k", "gain > 0 and power > 0", (self.gain, self.power))
+        require_numbers("class_k.gain", "a positive number", self.gain, lambda gain: gain > 0)
+        require_numbers("class_k.power", "a positive number", self.power, lambda power: power > 0)
 
     def __call__(self, h: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         return self.gain * (h if self.power == 1 else h.sign() * h.abs() ** self.power)
@@ -86,8 +87,8 @@ class CollisionAvoidance:
     `safety_distance` may be a tensor (m,), one distance per body.
 
     Raises:
-        InputError: not exactly one of the two is given. When called: `margin` needs radii, or `neighbour_velocity`
-            needs velocities, that the measurement does not have.
+        InputError: not exactly one of the two is given, or an argument has a wrong type. When called: `margin` needs
+            radii, or `neighbour_velocity` needs velocities, that the measurement does not have.
     """
 
     class_k: ClassK
@@ -98,7 +99,11 @@ class CollisionAvoidance:
     soft: bool = False
 
     def __post_init__(self) -> None:
+        if not isinstance(self.class_k, ClassK):
+            raise InputError("class_k", "a class-K function, e.g. ClassK(gain=1.0)", repr(self.class_k))
         require_distance(self.safety_distance, self.margin)
+        require_choice("distance", self.distance, ("squared", "euclidean"))
+        require_choice("neighbour_velocity", self.neighbour_velocity, get_args(NeighbourVelocity))
 
     def __call__(self, measurement: Measurement) -> Halfspaces:
         seen = self.geometry(measurement)
@@ -208,8 +213,10 @@ def require_distance(distance: float | Tensor | None, margin: float | None) -> N
     """
     if (distance is None) == (margin is None):
         raise InputError("safety_distance, margin", "exactly one of them", (distance, margin))
-    if distance is not None and not bool((torch.as_tensor(distance) > 0).all()):
-        raise InputError("safety_distance", "a positive distance [m]", distance)
+    if distance is not None:
+        require_numbers("safety_distance", "a positive distance [m]", distance, lambda d: d > 0)
+    if margin is not None:
+        require_numbers("margin", "a finite distance [m]", margin, torch.isfinite)
 
 
 def distance_kept(

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces
+from torchfsid.robots.arguments import require_numbers
 from torchfsid.robots.avoidance import ClassK, NeighbourVelocity
 from torchfsid.robots.bounds import ErrorBounds, RowErrors
 from torchfsid.robots.measurement import Measurement
@@ -151,8 +152,8 @@ class SpeedBox(_OfNoBody):
     quantity: Literal["speed", "acceleration"] = "speed"
 
     def __post_init__(self) -> None:
-        if not all(limit > 0 for limit in self.limit):
-            raise InputError("limit", "positive limits [units of the control]", self.limit)
+        expected = "a positive limit for each axis, e.g. (1.0, 1.0)"
+        require_numbers("limit", expected, self.limit, lambda limit: limit.ndim == 1 and bool((limit > 0).all()))
 
     def __call__(self, measurement: Measurement) -> Halfspaces:
         x = measurement.x
@@ -179,8 +180,8 @@ class SpeedPolygon(_OfNoBody):
     soft: bool = False
 
     def __post_init__(self) -> None:
-        if self.sides < 3 or not self.limit > 0:
-            raise InputError("speed_polygon", "sides >= 3 and limit > 0", (self.sides, self.limit))
+        require_numbers("sides", "a whole number >= 3", self.sides, lambda sides: sides >= 3)
+        require_numbers("limit", "a positive speed [m/s]", self.limit, lambda limit: limit > 0)
 
     def __call__(self, measurement: Measurement) -> Halfspaces:
         side = torch.arange(self.sides, dtype=torch.float64, device=measurement.x.device)
@@ -207,6 +208,8 @@ class Arena(_OfNoBody):
     soft: bool = False
 
     def __post_init__(self) -> None:
+        if not isinstance(self.class_k, ClassK):
+            raise InputError("class_k", "a class-K function, e.g. ClassK(gain=1.0)", repr(self.class_k))
         if len(self.lower) != len(self.upper) or not all(a < b for a, b in zip(self.lower, self.upper, strict=True)):
             raise InputError("arena", "lower < upper on every axis [m]", (self.lower, self.upper))
 

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchfsid.errors import InputError
+from torchfsid.robots.arguments import require_numbers
 from torchfsid.robots.measurement import Measurement
 
 
@@ -58,8 +58,7 @@ class NoiseBound:
         bounds = {"velocity": velocity, "slack": slack, "position": position, "neighbour_velocity": neighbour_velocity}
         bounds |= {"neighbour_acceleration": neighbour_acceleration, "arrival": arrival}
         for name, bound in bounds.items():
-            if not bool((torch.as_tensor(bound) >= 0).all()):
-                raise InputError(f"noise.{name}", "a bound >= 0", bound)
+            require_numbers(f"noise.{name}", "a bound >= 0", bound, lambda size: size >= 0)
             object.__setattr__(self, name, bound)
 
 

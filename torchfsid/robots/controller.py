@@ -24,8 +24,9 @@ from torch import Tensor
 
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.outcome import ProgrammeStatus
+from torchfsid.outcome import Status
 from torchfsid.programmes.differentiable import broadcast, nearest
+from torchfsid.robots.arguments import require_barriers, require_task
 from torchfsid.robots.barriers import Barrier, is_joint, neighbours_controls
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.speed_disc import least_violation, nearest_in_disc
@@ -62,7 +63,7 @@ def solve_safe_qp(safe_controls: Halfspaces, uhat: Float[Tensor, "*batch n"]) ->
         raise InputError("uhat", f"(*batch, {n})", tuple(uhat.shape))
     rows, y, _ = broadcast(safe_controls, uhat)
     nearest_control, mu, places, filled, status = nearest(rows, y)
-    feasible = status == ProgrammeStatus.OK
+    feasible = status == Status.OK
     u = torch.where(feasible.unsqueeze(-1), nearest_control, 0.0)
     held = torch.where(filled, 2 * mu.clamp(min=0), 0.0)
     multipliers = torch.zeros_like(rows.b).scatter_add(-1, places, held)[..., :m]
@@ -105,6 +106,8 @@ class CbfQpController:
     barriers: Sequence[Barrier]
 
     def __post_init__(self) -> None:
+        require_task(self.task)
+        require_barriers(self.barriers)
         if len(self.barriers) == 0:
             raise InputError("barriers", "at least one barrier", self.barriers)
         if len(self.barriers) > 1 and any(getattr(barrier, "relaxes", False) for barrier in self.barriers):

@@ -14,8 +14,9 @@ positions of the bodies, gains and distances.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -25,6 +26,7 @@ from torch import Tensor
 from torchfsid.errors import InputError
 from torchfsid.robots.controller import CbfQpController, Control
 from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.recording import write_run
 
 STILL = 1e-3
 """A robot stands still where its speed is at most this fraction of its nominal speed ..."""
@@ -153,6 +155,22 @@ class Trajectory:
     def measurements(self) -> Iterator[Measurement]:
         """All samples, in the order of time."""
         return (self.measurement(k) for k in range(len(self.t)))
+
+    def save(self, path: str | Path, names: Sequence[str] | None = None) -> Path:
+        """Write the run of one team as a log (CSV), which `fsid.read_log` and `torchfsid observe` read.
+
+        A log begins with its first sample. So where rows use the neighbours' previous velocities, observers of the log
+        skip that sample, and observers of `measurements` do not.
+
+        Args:
+            path: the file, *.csv.
+            names: the names of all bodies, robots first. Default: "0", "1", ... and "obstacle_0", ...
+
+        Raises:
+            InputError: it is a batch of teams, names do not fit, or the suffix is not .csv.
+            OSError: the file cannot be written.
+        """
+        return write_run(self, path, names)
 
 
 def simulate(

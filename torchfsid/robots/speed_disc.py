@@ -26,9 +26,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, dot
 from torchfsid.programmes.differentiable import inscribed_ball
+from torchfsid.robots.arguments import require_numbers
 from torchfsid.robots.avoidance import NeighbourVelocity
 from torchfsid.robots.bounds import ErrorBounds, RowErrors
 from torchfsid.robots.measurement import Measurement
@@ -52,8 +52,7 @@ class SpeedDisc:
     neighbour_velocity: ClassVar[NeighbourVelocity] = "none"
 
     def __post_init__(self) -> None:
-        if not self.limit > 0:
-            raise InputError("limit", "a positive speed [m/s]", self.limit)
+        require_numbers("limit", "a positive speed [m/s]", self.limit, lambda limit: limit > 0)
 
     @property
     def speed_limit(self) -> float:

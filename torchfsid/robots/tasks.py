@@ -19,6 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchfsid.errors import InputError
+from torchfsid.robots.arguments import require_names, require_numbers
 from torchfsid.robots.bounds import ErrorBounds
 from torchfsid.robots.measurement import Measurement
 
@@ -101,8 +102,7 @@ def feedback_of(task: Task, measurement: Measurement) -> Float[Tensor, "*batch n
 
 
 def _positive(name: str, value: float | Tensor) -> None:
-    if not bool(torch.as_tensor(value) > 0):
-        raise InputError(name, "a positive number", value)
+    require_numbers(name, "a positive number", value, lambda number: number > 0)
 
 
 def _identity_like(x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n n"]:
@@ -292,6 +292,8 @@ class PatrolTask:
 class AffineTask:
     """Any task that is affine in theta, with C (n, p) and d (n,) given as tensors or as functions of the measurement.
 
+    A function sees the batch of robots: for a measurement with x (B, n) it returns C (B, n, p), or d (B, n).
+
     `sensitivity` bounds the rate at which C theta + d changes with any position [1/s]. It is needed only if positions
     have errors.
     """
@@ -301,6 +303,9 @@ class AffineTask:
     parameter_names: tuple[str, ...]
     saturation: Saturation | None = None
     sensitivity: float | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "parameter_names", require_names("parameter_names", self.parameter_names))
 
     def __call__(self, measurement: Measurement) -> Affine:
         C = self.C(measurement) if callable(self.C) else self.C

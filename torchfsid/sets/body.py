@@ -1,4 +1,4 @@
-"""The interface of a batch of sets: a `Polygon` in the plane, a `Polytope` in other dimensions."""
+"""The interface of a batch of sets: a `Polygon` in the plane, a `Polyhedron` for p = 3, else a `Polytope`."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Clipped:
 
     Attributes:
         body: the intersection. Empty items keep the body from before the clip.
-        outcome: an `Outcome` per item.
+        outcome: a `Status` per item.
         shrunk: whether the clip made the item smaller.
         contradiction: the rows that contradict each other, for empty items.
     """

@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import nnls
 
-from torchfsid.outcome import Outcome
+from torchfsid.outcome import Status
 from torchfsid.sets.faces import Indices, Mask, Reals
 from torchfsid.sets.shape import Frame, Shape, lengths
 from torchfsid.tolerances import ROUND_OFF
@@ -85,13 +85,13 @@ class Intersection(NamedTuple):
     Attributes:
         cell: the intersection, or the cell from before if it is empty.
         origin: the index of each facet among the rows followed by the facets that the cell had before.
-        outcome: an `Outcome`.
+        outcome: a `Status`.
         contradiction: the rows and facets that contradict each other if it is empty, by the same indices.
     """
 
     cell: Cell
     origin: Indices
-    outcome: Outcome
+    outcome: Status
     contradiction: Indices
 
 
@@ -112,7 +112,7 @@ class _Row(NamedTuple):
 def intersect(cell: Cell, A: Reals, b: Reals) -> Intersection:
     """Cut a cell by the rows A z <= b, the deepest first, as long as one cuts by more than round-off."""
     origin = len(A) + np.arange(len(cell.b))
-    before, outcome, pending = (cell, origin), Outcome.NONEMPTY, np.ones(len(A), dtype=bool)
+    before, outcome, pending = (cell, origin), Status.OK, np.ones(len(A), dtype=bool)
     while True:
         over, tolerance = A @ cell.vertices.T - b[:, None], cell.round_off(A, b)
         deepest = over.max(1)
@@ -125,9 +125,9 @@ def intersect(cell: Cell, A: Reals, b: Reals) -> Intersection:
         if row.over.min() > row.tolerance:
             contradiction = _contradiction(cell, row, np.append(origin, i))
             if len(contradiction) > 0:
-                return Intersection(*before, Outcome.EMPTY, contradiction)
+                return Intersection(*before, Status.EMPTY, contradiction)
         if row.over.min() >= -row.tolerance:
-            outcome = Outcome.UNDECIDED
+            outcome = Status.UNDECIDED
         row = row.moved_outward()
         if row.over.max() > row.tolerance:
             cell, needed = _cut(cell, row)

@@ -2,11 +2,10 @@ r"""The feasible set Theta(t): where the parameter must lie, given everything se
 
     Theta(t) = Theta_0  intersected with all  Omega(tau), tau <= t          Theta_0 a box, the prior
 
-A set is a value: `intersect` returns a new one. It is a batch of polygons in the plane, and of polytopes in other
-dimensions. Both are differentiable. Up to round-off, a set contains the truth if all half-spaces do. Its volume never
-grows, and it stays bounded. The order of the half-spaces does not matter, and a smaller bound never gives a larger set.
-Its memory is that of its facets. More than `max_facets` are merged outward. Each facet keeps the time and the
-constraint that it came from.
+A set is a value: `intersect` returns a new one. It is a batch of polygons, of polyhedra for p = 3, or of polytopes. All
+are differentiable. Up to round-off, a set contains the truth if all half-spaces do. Its volume never grows, and it
+stays bounded. The order of the half-spaces does not matter, and a smaller bound never gives a larger set. Its memory is
+that of its facets. More than `max_facets` are merged outward. Each facet keeps its time and constraint.
 
 An EMPTY item has volume 0 and contains nothing. Its centroid, vertices, diameter, support, Chebyshev centre and nearest
 points are NaN. Its radius is minus the depth of the contradiction: the least distance by which the rows that contradict
@@ -15,59 +14,42 @@ each other have to be moved outward. All its gradients are zero.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import nan
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchfsid.errors import InputError
-from torchfsid.halfspaces import Halfspaces, array, finite, reals
+from torchfsid.halfspaces import Halfspaces, array, finite
 from torchfsid.kernels import extent
-from torchfsid.outcome import Outcome
+from torchfsid.outcome import Status
 from torchfsid.programmes.differentiable import inscribed_ball, symmetric
+from torchfsid.sets import given, sampling, saved
+from torchfsid.sets.facets import Emptiness, Facets
 from torchfsid.sets.polygon import Polygon
+from torchfsid.sets.polyhedron import Polyhedron
 from torchfsid.sets.polytope import Polytope
 
 MAX_FACETS = 32
 """Facets kept; more are merged outward. Costs below 1 % of the volume (tests/test_feasible_set.py)."""
 
 
-class Facets(NamedTuple):
-    """Rows A z <= b of a set, with the time [s] and the constraint (`source`) of each. The prior has NaN and -1."""
-
-    halfspaces: Halfspaces
-    time: Float[Tensor, "*batch f"]
-    source: Int[Tensor, "*batch f"]
-
-
-class Emptiness(NamedTuple):
-    """Whether a set is empty, with a proof.
-
-    Attributes:
-        outcome: an `Outcome` per item. UNDECIDED means that a half-space touches the others within round-off. The set
-            is what they leave after that half-space is moved outward by its round-off.
-        witness: a point inside. NaN unless NONEMPTY.
-        contradiction: the rows that contradict each other. NaN unless EMPTY.
-    """
-
-    outcome: Int[Tensor, "*batch"]
-    witness: Float[Tensor, "*batch p"]
-    contradiction: Facets
-
-
 @dataclass(frozen=True)
 class FeasibleSet:
     """A batch of bounded convex sets of parameters. Build it with `from_box`, shrink it with `intersect`.
 
+    `sets[0]` and `sets[1:3]` are parts of a batch, `one[None]` is a batch of one. Its shape is free, but
+    `torch.func.vmap` does not run over sets: searches look at the numbers. The layers of `programmes` take sets, too.
+
     Attributes:
-        body: the sets with the batch flattened, a `Polygon` in the plane and a `Polytope` in other dimensions.
+        body: the sets with the batch flattened, a `Polygon` for p = 2, a `Polyhedron` for p = 3, else a `Polytope`.
         batch_shape: the shape of the batch.
-        outcome: an `Outcome` per item. An EMPTY item contains nothing and stays empty, whatever its body.
+        outcome: a `Status` per item. An EMPTY item contains nothing and stays empty, whatever its body.
         contradiction: the rows that no parameter satisfies together, for EMPTY items.
         last_cut: the time of the intersection that last shrank the set [s]; NaN if there was none.
         max_facets: the largest number of facets that are kept.
@@ -90,30 +72,62 @@ class FeasibleSet:
             InputError: shapes differ, p = 0, lower < upper fails somewhere, the box is not bounded, or `max_facets` are
                 too few to bound a set.
         """
-        lower, upper = reals("lower", lower), reals("upper", upper)
-        if lower.shape != upper.shape or lower.ndim == 0 or lower.shape[-1] == 0:
-            raise InputError("lower, upper", "two tensors (*batch, p)", (tuple(lower.shape), tuple(upper.shape)))
-        if not bool((lower < upper).all()):
-            raise InputError("lower, upper", "lower < upper in every coordinate", (lower.tolist(), upper.tolist()))
-        if not finite(lower, upper):
-            raise InputError("lower, upper", "a bounded box", (lower.tolist(), upper.tolist()))
+        lower, upper = given.box(lower, upper)
         batch, p = lower.shape[:-1], lower.shape[-1]
         if max_facets < 2 * p:
             raise InputError("max_facets", f"at least {2 * p}, the facets of the prior box", max_facets)
-        kind = Polygon if p == 2 else Polytope
-        nothing = lower.new_full((*batch, p + 1), float("nan"))
+        kind = Polygon if p == 2 else Polyhedron if p == 3 else Polytope
         return cls(
             body=kind.from_box(lower.reshape(-1, p), upper.reshape(-1, p)),
             batch_shape=batch,
-            outcome=torch.full(batch, Outcome.NONEMPTY, device=lower.device),
-            contradiction=Facets(
-                Halfspaces(nothing.unsqueeze(-1).expand(*batch, p + 1, p), nothing),
-                nothing,
-                torch.full_like(nothing, -1).long(),
-            ),
+            outcome=torch.full(batch, Status.OK, device=lower.device),
+            contradiction=Facets.none(batch, p, lower),
             last_cut=lower.new_full(batch, float("nan")),
             max_facets=max_facets,
         )
+
+    @classmethod
+    def from_halfspaces(cls, halfspaces: Halfspaces, max_facets: int = MAX_FACETS) -> FeasibleSet:
+        """The sets {theta : A theta <= b}, with the gradients of their rows.
+
+        Raises:
+            InputError: a set is not bounded, or a row is NaN or infinite.
+        """
+        return cls.from_box(*given.box_around(halfspaces), max_facets).intersect(halfspaces)
+
+    @classmethod
+    def from_vertices(cls, vertices: Float[Tensor, "*batch v 2"], max_facets: int = MAX_FACETS) -> FeasibleSet:
+        """The convex hulls of points in the plane, in any order, with the gradients of the points.
+
+        Raises:
+            InputError: they are no points in the plane, not finite, or on one line.
+        """
+        corners = given.planar(vertices)
+        return cls.from_box(*given.box_around_points(corners), max_facets).intersect(given.edges_of(corners))
+
+    @classmethod
+    def from_state_dict(cls, state: Mapping[str, Any]) -> FeasibleSet:
+        """The sets that `state_dict` was called for. They have no gradients."""
+        return cls(**saved.read(state))
+
+    def state_dict(self) -> dict[str, Any]:
+        """The sets as tensors by name, for `torch.save`, without gradients. `torch.load` needs no more than them."""
+        return saved.state_of(self)
+
+    def to(self, device: torch.device | str) -> FeasibleSet:
+        """The sets on another device, with their gradients. The numbers stay in float64."""
+        return saved.mapped(self, lambda part: part.to(device))
+
+    def __repr__(self) -> str:
+        return saved.described(self)
+
+    def __len__(self) -> int:
+        return len(self.outcome)
+
+    def __getitem__(self, index: Any) -> FeasibleSet:
+        """The sets at the places `index` of the batch, which indexes it like a tensor."""
+        places = torch.arange(self.batch_shape.numel(), device=self.outcome.device).reshape(self.batch_shape)
+        return self._at(places[index])
 
     @property
     def dim(self) -> int:
@@ -121,18 +135,13 @@ class FeasibleSet:
 
     @property
     def is_empty(self) -> Bool[Tensor, "*batch"]:
-        return self.outcome == Outcome.EMPTY
+        return self.outcome == Status.EMPTY
 
     @cached_property
     def any_empty(self) -> bool:
-        """Is any of the sets empty?"""
-        return bool((array(self.outcome) == Outcome.EMPTY).any())
+        return bool((array(self.outcome) == Status.EMPTY).any())
 
-    def intersect(
-        self,
-        halfspaces: Halfspaces,
-        time: float | Float[Tensor, "*#batch m"] = float("nan"),
-    ) -> FeasibleSet:
+    def intersect(self, halfspaces: Halfspaces, time: float | Float[Tensor, "*#batch m"] = nan) -> FeasibleSet:
         """The part of the set inside the half-spaces.
 
         New facets keep the `time` [s] and the `source` of their rows (default: 0, 1, ...). A row that only touches the
@@ -143,7 +152,7 @@ class FeasibleSet:
             InputError: dimension or batch do not fit, or a row is NaN or infinite.
         """
         p, m = self.dim, halfspaces.rows
-        if halfspaces.dim != p or not _fits(halfspaces.batch_shape, self.batch_shape):
+        if halfspaces.dim != p or not given.fits(halfspaces.batch_shape, self.batch_shape):
             expected = f"rows over R^{p} for a batch {tuple(self.batch_shape)}"
             raise InputError("halfspaces", expected, (tuple(halfspaces.A.shape), tuple(halfspaces.b.shape)))
         if not finite(halfspaces.A, halfspaces.b):
@@ -169,12 +178,8 @@ class FeasibleSet:
         if not decided:
             outcome = torch.maximum(outcome, clipped.outcome.reshape(shape))
             found = clipped.contradiction
-            fresh = Facets(
-                Halfspaces(found.A.reshape(*shape, p + 1, p), found.b.reshape(*shape, p + 1)),
-                found.time.reshape((*shape, p + 1)),
-                found.source.reshape((*shape, p + 1)),
-            )
-            against = _choose(self.is_empty, against, fresh)
+            fresh = Facets.of((found.A, found.b, found.time, found.source), shape)
+            against = against.where(self.is_empty, fresh)
         last_cut = torch.where(clipped.shrunk.reshape(shape), stamp.amax(-1), self.last_cut)
         return replace(self, body=body, outcome=outcome, contradiction=against, last_cut=last_cut)
 
@@ -185,7 +190,7 @@ class FeasibleSet:
             self,
             body=self.body.replaced(items, other.body.select(items)),
             outcome=torch.where(mask, self.outcome, other.outcome),
-            contradiction=_choose(mask, self.contradiction, other.contradiction),
+            contradiction=self.contradiction.where(mask, other.contradiction),
             last_cut=torch.where(mask, self.last_cut, other.last_cut),
         )
 
@@ -200,15 +205,17 @@ class FeasibleSet:
         except (IndexError, TypeError) as error:
             expected = f"places in, or a mask of, a batch (B,) of sets, here {tuple(self.batch_shape)}"
             raise InputError("items", expected, items) from error
-        against = self.contradiction
-        rows = Halfspaces(against.halfspaces.A[items], against.halfspaces.b[items])
+        return self._at(items)
+
+    def _at(self, places: Int[Tensor, "*places"]) -> FeasibleSet:
+        """The sets at these places of the flattened batch."""
         return replace(
             self,
-            body=self.body.select(items),
-            batch_shape=items.shape,
-            outcome=self.outcome[items],
-            contradiction=Facets(rows, against.time[items], against.source[items]),
-            last_cut=self.last_cut[items],
+            body=self.body.select(places.reshape(-1)),
+            batch_shape=places.shape,
+            outcome=self.outcome.reshape(-1)[places],
+            contradiction=self.contradiction.at(places, len(self.batch_shape)),
+            last_cut=self.last_cut.reshape(-1)[places],
         )
 
     @classmethod
@@ -218,40 +225,36 @@ class FeasibleSet:
         Raises:
             InputError: there are no parts, or they have different dimensions or no batch.
         """
-        if len({part.dim for part in parts}) != 1 or any(len(part.batch_shape) != 1 for part in parts):
-            expected = "batches (B,) of sets of the same dimension"
-            raise InputError("parts", expected, [(tuple(part.batch_shape), part.dim) for part in parts])
-        places = torch.arange(sum(len(part.outcome) for part in parts), device=parts[0].outcome.device)
-        whole, last = parts[0].select(torch.zeros_like(places)), 0
-        for part in parts:
-            first, last = last, last + len(part.outcome)
-            whole = replace(whole, body=whole.body.replaced(places[first:last], part.body))
-        against = [part.contradiction for part in parts]
-        rows = [facets.halfspaces for facets in against]
-        return replace(
-            whole,
-            outcome=torch.cat([part.outcome for part in parts]),
-            contradiction=Facets(
-                Halfspaces(torch.cat([row.A for row in rows]), torch.cat([row.b for row in rows])),
-                torch.cat([facets.time for facets in against]),
-                torch.cat([facets.source for facets in against]),
-            ),
-            last_cut=torch.cat([part.last_cut for part in parts]),
-        )
+        return saved.joined(parts)
 
     def emptiness(self) -> Emptiness:
         """Whether a parameter is left, with a proof of either answer."""
-        sure = (self.outcome == Outcome.NONEMPTY).unsqueeze(-1)
+        sure = (self.outcome == Status.OK).unsqueeze(-1)
         return Emptiness(self.outcome, torch.where(sure, self.chebyshev()[0], float("nan")), self.contradiction)
 
     def facets(self) -> Facets:
         """The half-spaces that form the set, padded with 0.z <= 1. An EMPTY item gives those of the set before."""
         A, b = self.body.rows()
-        return Facets(
-            Halfspaces(self._batched(A), self._batched(b)),
-            self._batched(self.body.time),
-            self._batched(self.body.source),
-        )
+        return Facets.of((A, b, self.body.time, self.body.source), self.batch_shape)
+
+    def halfspaces(self) -> Halfspaces:
+        """Rows A theta <= b that say what the set is, padded. Those of an EMPTY item contradict each other."""
+        rows = self.facets().halfspaces
+        if not self.any_empty:
+            return rows
+        lost, against = self.is_empty.unsqueeze(-1), self.contradiction.known
+        return Halfspaces.stack([rows.where((~lost).expand_as(rows.b)), against.where(lost.expand_as(against.b))])
+
+    def sample(self, n: int, generator: torch.Generator | None = None) -> Float[Tensor, "n *batch p"]:
+        """`n` points of each set, uniformly distributed, without gradients. NaN for an EMPTY item.
+
+        Args:
+            n: the number of points.
+            generator: the source of randomness. None: torch's own.
+        """
+        corners = self.vertices()
+        points = sampling.uniform(corners.reshape(-1, *corners.shape[-2:]), n, generator)
+        return points.reshape(n, *self.batch_shape, self.dim)
 
     def contains(self, theta: Float[Tensor, "*batch p"], tolerance: float = 1e-9) -> Bool[Tensor, "*batch"]:
         """Is theta in the set, up to round-off and `tolerance` times the set's diameter?
@@ -317,19 +320,14 @@ class FeasibleSet:
         known = flat.isfinite().all(-1)
         if metric is not None:
             metric = self._flat(symmetric(self._given("metric", metric, (p, p))), (p, p))
-            known = known & metric.isfinite().all((-1, -2))
-            identity = torch.eye(p, dtype=metric.dtype, device=metric.device)
-            _, fault = torch.linalg.cholesky_ex(torch.where(known[:, None, None], metric, identity).detach())
-            known = known & (fault == 0)
-            metric = torch.where(known[:, None, None], metric, identity)
+            metric, is_definite = given.definite(metric)
+            known = known & is_definite
         nearest = self.body.nearest(torch.where(known.unsqueeze(-1), flat, 0.0), metric)
         return self._unless_empty(torch.where(known.unsqueeze(-1), nearest, nan))
 
     def _depth(self) -> Float[Tensor, "*batch"]:
         """The depth of the contradictions. NaN where there is none, or where it has no finite depth."""
-        against = self.contradiction.halfspaces
-        known = ~(against.A.isnan().any(-1) | against.b.isnan())
-        _, radius, _ = inscribed_ball(Halfspaces(against.A, against.b).where(known))
+        _, radius, _ = inscribed_ball(self.contradiction.known)
         return torch.where(radius.detach() < 0, -radius.detach(), nan)
 
     def _unless_empty(self, flat: Tensor, instead: float | Tensor = nan) -> Tensor:
@@ -339,18 +337,8 @@ class FeasibleSet:
             return answer
         return torch.where(self.is_empty.reshape((*self.batch_shape, *[1] * (flat.ndim - 1))), instead, answer)
 
-    def _given(self, name: str, value: Tensor, shape: tuple[int, ...], broadcast: bool = False) -> Tensor:
-        """The value in float64. It must hold one item of `shape` per set. With `broadcast` it may hold several."""
-        value = reals(name, value)
-        batch, inner = value.shape[: value.ndim - len(shape)], tuple(value.shape[value.ndim - len(shape) :])
-        fits = inner == shape and _fits(
-            batch[max(0, len(batch) - len(self.batch_shape)) if broadcast else 0 :], self.batch_shape
-        )
-        if not fits:
-            raise InputError(
-                name, f"(*batch, {', '.join(map(str, shape))}), batch {tuple(self.batch_shape)}", tuple(value.shape)
-            )
-        return value
+    def _given(self, name: str, value: object, shape: tuple[int, ...], broadcast: bool = False) -> Tensor:
+        return given.per_set(name, value, shape, self.batch_shape, broadcast)
 
     def _flat(self, rows: Tensor, shape: tuple[int, ...]) -> Tensor:
         """One item of `shape` for each set, with the batch flattened."""
@@ -360,20 +348,3 @@ class FeasibleSet:
 
     def _batched(self, flat: Tensor) -> Tensor:
         return flat.reshape((*self.batch_shape, *flat.shape[1:]))
-
-
-def _fits(shape: torch.Size, batch: torch.Size) -> bool:
-    """Do rows of this batch shape broadcast to the sets' batch?"""
-    return len(shape) <= len(batch) and all(n in (1, N) for n, N in zip(reversed(shape), reversed(batch), strict=False))
-
-
-def _choose(mask: Bool[Tensor, "*batch"], mine: Facets, other: Facets) -> Facets:
-    rows = mask.unsqueeze(-1)
-    return Facets(
-        Halfspaces(
-            torch.where(rows.unsqueeze(-1), mine.halfspaces.A, other.halfspaces.A),
-            torch.where(rows, mine.halfspaces.b, other.halfspaces.b),
-        ),
-        torch.where(rows, mine.time, other.time),
-        torch.where(rows, mine.source, other.source),
-    )

@@ -23,7 +23,7 @@ from torch import Tensor
 from torchfsid.halfspaces import Halfspaces, array
 from torchfsid.kernels import disc, extent, foot
 from torchfsid.kernels import polygon as kernel
-from torchfsid.outcome import ProgrammeStatus
+from torchfsid.outcome import Status
 from torchfsid.programmes.differentiable import inscribed_ball
 from torchfsid.sets import derivatives
 from torchfsid.sets.body import PRIOR, Clipped, Contradiction
@@ -267,7 +267,7 @@ class Polygon:
         centre = self.corners.mean(1)
         rows = Halfspaces(self.A, self.b - (self.A @ centre.unsqueeze(-1)).squeeze(-1))
         step, radius, status = inscribed_ball(rows)
-        ok, lost = status == ProgrammeStatus.OK, status == ProgrammeStatus.UNSOLVED
+        ok, lost = status == Status.OK, status == Status.UNSOLVED
         about = torch.where(lost, rows.slack(torch.zeros_like(centre)).amin(-1), 0.0)
         # Where there is no disc, the set is flat to round-off.
         return centre + torch.where(ok.unsqueeze(-1), step, 0.0), torch.where(ok, radius, about)

@@ -1,4 +1,4 @@
-r"""Batched convex polytopes: the sets of parameters in other dimensions than the plane (p = 1, 3, 4, ...).
+r"""Batched convex polytopes: the sets of parameters in other dimensions than 2 and 3 (p = 1, 4, 5, ...).
 
 They have the interface of `polygon`. Searches run in numpy, without gradients. `cell` finds the facets that are left
 after a clip, `shape` finds volume and centroid, `programmes` finds the nearest point and the inscribed ball. Every
@@ -20,17 +20,16 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchfsid.halfspaces import Halfspaces, array
+from torchfsid.halfspaces import array
 from torchfsid.kernels import extent
-from torchfsid.outcome import Outcome, ProgrammeStatus
-from torchfsid.programmes.differentiable import inscribed_ball, nearest_point, times
-from torchfsid.sets import derivatives, sensitivity
+from torchfsid.outcome import Status
+from torchfsid.sets import derivatives, recentred, sensitivity
 from torchfsid.sets.body import PRIOR, Clipped, Contradiction
 from torchfsid.sets.cell import Cell, intersect, merged
 from torchfsid.sets.derivatives import at
 from torchfsid.sets.faces import Indices, Mask, Reals
 from torchfsid.sets.provenance import Sheets
-from torchfsid.sets.shape import FLAT, Shape
+from torchfsid.sets.shape import Shape
 from torchfsid.tolerances import ROUND_OFF
 
 
@@ -111,7 +110,7 @@ class Polytope:
     ) -> Clipped:
         (B, R, p), F, device = A.shape, self.b.shape[1], self.A.device
         cells, origins, against = list(self._cells), self._origins(), np.full((B, p + 1), -1)
-        outcome, shrunk, rows, right = np.full(B, int(Outcome.NONEMPTY)), np.zeros(B, dtype=bool), array(A), array(b)
+        outcome, shrunk, rows, right = np.full(B, int(Status.OK)), np.zeros(B, dtype=bool), array(A), array(b)
         for i in np.flatnonzero(self._exceeded(rows, right)):
             found = intersect(cells[i], rows[i], right[i])
             # The polytopes' own rows come first among all rows, item by item.
@@ -183,35 +182,14 @@ class Polytope:
         return (direction * sensitivity.extreme(*self.rows(), self.shape, furthest, direction)).sum(-1)
 
     def chebyshev(self) -> tuple[Float[Tensor, "B p"], Float[Tensor, "B"]]:
-        """Centre and radius of a largest inscribed ball: max r s.t. A_f.z + |A_f| r <= b_f.
-
-        Where the centre is not unique, the one with the smallest z_1 is returned, among these the one with the smallest
-        z_2, and so on. Its gradient is that of the p + 1 facets that decide this choice. The radius and its gradient
-        are right in any case. A flat set has the radius 0, and its centre is a point of the set. Where no ball could be
-        verified as a largest one, it is the largest about a point of the set.
-        """
-        rows = self._recentred
-        centre, radius, status = inscribed_ball(rows)
-        flat, lost = radius <= FLAT * self.reach.amax(-1), status == ProgrammeStatus.UNSOLVED
-        if bool(lost.any()):
-            radius = torch.where(lost, rows.slack(torch.zeros_like(centre)).amin(-1).clamp(min=0.0), radius)
-        centre = self._middle + torch.where((flat | lost).unsqueeze(-1), 0.0, centre)
-        return centre, torch.where(flat, 0.0, radius)
+        """Centre and radius of a largest inscribed ball. See `recentred.chebyshev`."""
+        return recentred.chebyshev(*self.rows(), self._as_tensor(self.shape.middle), self.reach)
 
     def nearest(
         self, point: Float[Tensor, "B p"], metric: Float[Tensor, "B p p"] | None = None
     ) -> Float[Tensor, "B p"]:
-        """The point of the set nearest to `point` in the norm sqrt(z' metric z) (default: Euclidean).
-
-        The result is NaN where `point` or `metric` is not finite, or `metric` is not positive definite.
-        """
-        rows, point = self._recentred, point - self._middle
-        found = nearest_point(rows, point, metric)
-        lost = found.status == ProgrammeStatus.EMPTY
-        if bool(lost.any()):  # lost to the round-off of the middle, as in a flat set
-            wider = rows.b + torch.where(lost.unsqueeze(-1), 2 * self._round_off, 0.0)
-            found = nearest_point(Halfspaces(rows.A, wider), point, metric)
-        return self._middle + found.point
+        """The point of the set nearest to `point` in the norm sqrt(z' metric z). See `recentred.nearest`."""
+        return recentred.nearest(*self.rows(), self._as_tensor(self.shape.middle), self.reach, point, metric)
 
     # Parts of the computation ---------------------------------------------------------------------------------------
 
@@ -243,22 +221,6 @@ class Polytope:
         if self._differentiable:
             return sensitivity.measure(*self.rows(), self.shape)
         return self._as_tensor(self.shape.volume), self._as_tensor(self.shape.centroid)
-
-    @property
-    def _middle(self) -> Float[Tensor, "B p"]:
-        """A point of the set, without gradients."""
-        return self._as_tensor(self.shape.middle)
-
-    @property
-    def _recentred(self) -> Halfspaces:
-        """The set with its middle moved to the origin. Its round-off is then proportional to its size."""
-        A, b = self.rows()
-        return Halfspaces(A, b - times(A, self._middle))
-
-    @property
-    def _round_off(self) -> Float[Tensor, "B F"]:
-        """A bound on the rounding error of A z - b over the set."""
-        return ROUND_OFF * (times(self.A.abs(), self.reach) + self.b.abs())
 
     def _as_tensor(self, field: Reals) -> Tensor:
         return torch.as_tensor(field, device=self.A.device)

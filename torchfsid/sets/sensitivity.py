@@ -22,6 +22,28 @@ from torchfsid.sets.faces import Indices, Mask, Reals, optimal_bases
 from torchfsid.sets.shape import Shape, lengths
 
 
+class Frame(NamedTuple):
+    """The frames of the sets: z = middle + (y * scale) axes."""
+
+    middle: Float[Tensor, "B p"]
+    axes: Float[Tensor, "B p p"]
+    scale: Float[Tensor, "B p"]
+
+    def rows(self, A: Tensor, b: Tensor) -> tuple[Float[Tensor, "B F p"], Float[Tensor, "B F"]]:
+        """The rows A z <= b, of unit length, as rows over y."""
+        unit = Halfspaces(A, b).normalised()
+        return unit.A @ self.axes.mT * self.scale.unsqueeze(-2), unit.b - times(unit.A, self.middle)
+
+    def outside(self, change: Float[Tensor, "B N p"]) -> Float[Tensor, "B N p"]:
+        """The changes of z that belong to changes of y."""
+        return change * self.scale.unsqueeze(-2) @ self.axes
+
+
+def change(value: Tensor) -> Tensor:
+    """Zero with the derivatives of `value`. So numbers do not depend on whether a gradient is asked for."""
+    return value - value.detach()
+
+
 def vertices(A: Float[Tensor, "B F p"], b: Float[Tensor, "B F"], shape: Shape) -> Float[Tensor, "B V p"]:
     """The vertices as functions of the rows. A vertex that is not the solution of p facets is constant."""
     moved = _solutions(A, b, shape, shape.vertices, shape.y, *shape.bases)
@@ -53,53 +75,31 @@ def _solutions(
     A: Tensor, b: Tensor, shape: Shape, corners: Reals, y: Reals, basis: Indices, solved: Mask
 ) -> Float[Tensor, "B K p"]:
     """The corners, with the coordinates y, as the solutions of the facets `basis`. Constant where not `solved`."""
-    frame = _Frame.of(shape, A)
+    frame = _frame(shape, A)
     rows, right = frame.rows(A, b)
     number, place, index, known = (torch.as_tensor(field, device=A.device) for field in (corners, y, basis, solved))
-    return number + frame.outside(_change(derivatives.solution(place, at(rows, index), at(right, index), known)))
+    return number + frame.outside(change(derivatives.solution(place, at(rows, index), at(right, index), known)))
 
 
 def measure(
     A: Float[Tensor, "B F p"], b: Float[Tensor, "B F"], shape: Shape
 ) -> tuple[Float[Tensor, "B"], Float[Tensor, "B p"]]:
     """Volume and centroid as functions of the rows."""
-    frame, solid = _Frame.of(shape, A), shape.solid
+    frame, solid = _frame(shape, A), shape.solid
     rows, right = frame.rows(A, b)
     found = (solid.y, *shape.solid_bases, *_padded(*shape.simplices, solid.y.shape[1], b.shape), ~shape.is_flat)
     skeleton = Skeleton(*(torch.as_tensor(field, device=A.device) for field in found))
     volume, centroid = (torch.as_tensor(field, device=A.device) for field in (solid.volume, solid.centroid))
     volume, centroid = derivatives.measure(rows, right, volume, centroid, skeleton)
-    moved = frame.outside(_change(centroid).unsqueeze(1)).squeeze(1)
+    moved = frame.outside(change(centroid).unsqueeze(1)).squeeze(1)
     return (
-        torch.as_tensor(shape.volume, device=A.device) + _change(volume) * frame.scale.prod(-1),
+        torch.as_tensor(shape.volume, device=A.device) + change(volume) * frame.scale.prod(-1),
         torch.as_tensor(shape.centroid, device=A.device) + moved,
     )
 
 
-class _Frame(NamedTuple):
-    """The frames of the sets: z = middle + (y * scale) axes."""
-
-    middle: Float[Tensor, "B p"]
-    axes: Float[Tensor, "B p p"]
-    scale: Float[Tensor, "B p"]
-
-    @classmethod
-    def of(cls, shape: Shape, like: Tensor) -> _Frame:
-        return cls(*(torch.as_tensor(field, device=like.device) for field in shape.frame[:3]))
-
-    def rows(self, A: Tensor, b: Tensor) -> tuple[Float[Tensor, "B F p"], Float[Tensor, "B F"]]:
-        """The rows A z <= b, of unit length, as rows over y."""
-        unit = Halfspaces(A, b).normalised()
-        return unit.A @ self.axes.mT * self.scale.unsqueeze(-2), unit.b - times(unit.A, self.middle)
-
-    def outside(self, change: Float[Tensor, "B N p"]) -> Float[Tensor, "B N p"]:
-        """The changes of z that belong to changes of y."""
-        return change * self.scale.unsqueeze(-2) @ self.axes
-
-
-def _change(value: Tensor) -> Tensor:
-    """Zero with the derivatives of `value`. So numbers do not depend on whether a gradient is asked for."""
-    return value - value.detach()
+def _frame(shape: Shape, like: Tensor) -> Frame:
+    return Frame(*(torch.as_tensor(field, device=like.device) for field in shape.frame[:3]))
 
 
 def _padded(corners: Indices, facet: Indices, V: int, rows: torch.Size) -> tuple[Indices, Indices]:

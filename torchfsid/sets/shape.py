@@ -14,14 +14,10 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from torchfsid.sets.faces import Indices, Mask, Reals, bases, pyramids, simplices
-from torchfsid.tolerances import ROUND_OFF
+from torchfsid.tolerances import FLAT, ROUND_OFF
 
 OPEN = 1e-9
 """The normals of a closed surface times their areas add up to zero: to this share of its area."""
-
-FLAT = 8 * ROUND_OFF
-"""A set is flat where its half width is below this share of the largest coordinate that it ever had: rows that only
-touch leave a sliver which is no wider."""
 
 
 class Frame(NamedTuple):
