@@ -144,7 +144,8 @@ def advance(
     for k in range(B):
         for s in range(start[k], S):
             if running[k] and moved[s, k] and seen[s, k]:
-                works = predict(x[k], P[k], n, dt[s], G[s, k], f[s, k], walk[s], drift[s, k], mean, M, L)
+                works = s > start[k] or factor(P[k], N, L)  # later ones have been found to be definite
+                works = works and predict(x[k], P[k], n, dt[s], G[s, k], f[s, k], walk[s], drift[s, k], mean, M, L)
                 if not (works and correct(z[s, k], n, noise, mean, M, L, gain, before, error)):
                     stop[k] = s
                     break
