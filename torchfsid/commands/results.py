@@ -149,7 +149,7 @@ class ResultsWriter:
         places = (described[place].text for place in array(sets.which.flatten()).tolist())
         rows = zip(heads, active, places, ukf, hybrid, names, strict=True)
         lines = [",".join(row) + "\r\n" for row in rows]
-        self._estimates.write_text("".join(lines))
+        self._estimates.write_texts("".join(lines[k : k + robots]) for k in range(0, items, robots))
         for s in sorted({0, *_changes(sets.which), samples - 1}):
             at = sets.which[s]
             self._sets.see(

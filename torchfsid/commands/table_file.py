@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import accumulate
 from pathlib import Path
 
 from torch import Tensor
@@ -39,19 +40,22 @@ class TableFile:
         """Write all lines or none, even if writing fails or is interrupted."""
         text = io.StringIO(newline="")
         csv.writer(text).writerows(lines)
-        self.write_text(text.getvalue())
+        self.write_texts([text.getvalue()])
 
-    def write_text(self, text: str) -> None:
-        """Write lines that are CSV already (`line_of`), all or none."""
+    def write_texts(self, texts: Iterable[str]) -> None:
+        """Write texts of whole lines (`line_of`). If writing fails or is interrupted, each is there wholly or not."""
         if self.problem is not None:
             return
-        content, whole = text.encode(), self._file.tell()
+        contents = [text.encode() for text in texts]
+        content, start = b"".join(contents), self._file.tell()
         try:
             with named(self.path):
                 while content:
                     content = content[self._file.write(content) :]
         except BaseException as error:
-            self._file.truncate(whole)
+            ends = accumulate(map(len, contents), initial=start)
+            written = self._file.tell()
+            self._file.truncate(max(end for end in ends if end <= written))
             if not isinstance(error, OSError):
                 raise
             self.problem = error
