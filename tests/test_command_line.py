@@ -258,7 +258,7 @@ def test_without_a_command_the_commands_are_named(
         main([])
     error = capsys.readouterr().err
     assert error.count("\n") == 1
-    assert "{observe,check}" in error or "{run,sweep,design,figures}" in error
+    assert "{init,observe,check,schema,report}" in error or "{run,sweep,design,figures,report}" in error
 
 
 @pytest.mark.parametrize("stream", ["stdout", "stderr"])
