@@ -16,9 +16,9 @@ from rich.markup import escape
 
 import experiments.__main__
 import torchfsid.cli
+from torchfsid.commands.clock import seconds
 from torchfsid.commands.command_line import execute
 from torchfsid.commands.interruption import uninterrupted
-from torchfsid.commands.results import seconds
 from torchfsid.commands.results_folder import ResultsFolder
 from torchfsid.commands.terminal import aside, console, digits, status, table, track
 from torchfsid.errors import ConfigError, LogError

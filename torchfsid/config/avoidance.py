@@ -90,6 +90,11 @@ class _KeepsDistance(Strict):
         """Do the rows need the bodies' radii?"""
         return self.margin is not None
 
+    @property
+    def _distance(self) -> str:
+        """The key of the distance that is kept."""
+        return "safety_distance" if self.margin is None else "margin"
+
     def require_radii(self, radius: Sequence[float] | None) -> None:
         """Check that the log has the radii that the rows need [m].
 
@@ -150,6 +155,11 @@ class AvoidanceConfig(_KeepsDistance):
         if self.shared is not None and not self.is_unknown:
             raise wrong("expected an unknown gain or distance [low, high] to be shared", "shared")
         return self
+
+    @property
+    def suspects(self) -> tuple[str, ...]:
+        """The keys to look at where a row of the barrier contradicts a log."""
+        return ("class_k.gain", "class_k.power", self._distance, "neighbour_velocity")
 
     @property
     def is_unknown(self) -> bool:
@@ -224,6 +234,11 @@ class SecondOrderAvoidanceConfig(_KeepsDistance):
                 "bodies have no distances of their own where the safety distance is unknown", "safety_distances"
             )
         return self
+
+    @property
+    def suspects(self) -> tuple[str, ...]:
+        """The keys to look at where a row of the barrier contradicts a log."""
+        return ("class_k.0.gain", "class_k.1.gain", self._distance, "neighbour_acceleration")
 
     @property
     def uncertain(self) -> bool:

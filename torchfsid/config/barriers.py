@@ -33,8 +33,13 @@ if TYPE_CHECKING:
 
 
 class _RobotsOwn(Strict):
-    """A barrier whose rows do not depend on other bodies."""
+    """A barrier whose rows do not depend on other bodies.
 
+    Attributes:
+        suspects: the keys to look at where a row of the barrier contradicts a log.
+    """
+
+    suspects: ClassVar[tuple[str, ...]] = ("limit",)
     is_unknown: ClassVar[bool] = False
     is_second_order: ClassVar[bool] = False
     uncertain: ClassVar[bool] = False
@@ -105,6 +110,7 @@ class ArenaConfig(_RobotsOwn):
     margin: NonNegative = 0.0
     class_k: ClassKConfig
     soft: Flag = False
+    suspects: ClassVar[tuple[str, ...]] = ("class_k.gain", "margin", "lower", "upper")
 
     @model_validator(mode="after")
     def _is_a_box(self) -> ArenaConfig:
@@ -162,6 +168,7 @@ class OrcaConfig(Strict):
     is_unknown: ClassVar[bool] = False
     is_second_order: ClassVar[bool] = False
     uncertain: ClassVar[bool] = True
+    suspects: ClassVar[tuple[str, ...]] = ("time_horizon", "margin", "max_speed", "time_step")
     narrowed: ClassVar[Units] = {("time_horizon",): "s", ("margin",): "m"}
 
     @model_validator(mode="after")

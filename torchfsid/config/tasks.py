@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
@@ -51,6 +51,18 @@ SaturationConfig = Annotated[NormSaturationConfig | BoxSaturationConfig, Field(d
 
 
 class _Task(Strict):
+    """A task.
+
+    Attributes:
+        unit: the unit of all entries of theta; empty if they have different ones.
+        is_place: theta is a place among the robots, if it has as many entries.
+        suspects: the keys to look at where the nominal control contradicts a log.
+    """
+
+    unit: ClassVar[str] = "m"
+    is_place: ClassVar[bool] = True
+    suspects: ClassVar[tuple[str, ...]] = ("kind",)
+
     @property
     def parameters(self) -> int:
         """p, the number of entries of theta."""
@@ -136,6 +148,13 @@ class GoalConfig(_Task):
         return self
 
     @property
+    def suspects(self) -> tuple[str, ...]:
+        if self.law == "constant_speed":
+            return ("speed", "tolerance")
+        beside = [key for key in ("damping", "velocity_loop") if getattr(self, key) is not None]
+        return ("gain", *beside, "saturation" if self.saturation is None else "saturation.limit")
+
+    @property
     def narrowed(self) -> Units:
         """The unit of the gain of robots with damping is that of robots that are driven by accelerations."""
         return {("gain",): "1/s" if self.damping is None else "1/s2"}
@@ -177,6 +196,7 @@ class UnknownGainGoalConfig(_Task):
     """`UnknownGainGoalTask`: theta = (k, k x_d)."""
 
     kind: Literal["goal_unknown_gain"] = "goal_unknown_gain"
+    unit: ClassVar[str] = ""
 
     @property
     def parameters(self) -> int:
@@ -193,6 +213,8 @@ class VelocityConfig(_Task):
     """`VelocityTask`: keep a constant velocity."""
 
     kind: Literal["velocity"] = "velocity"
+    unit: ClassVar[str] = "m/s"
+    is_place: ClassVar[bool] = False
 
     def build(self, bodies: Sequence[str]) -> Task:
         """The `VelocityTask`."""
@@ -207,6 +229,8 @@ class FormationConfig(_Task):
     kind: Literal["formation"] = "formation"
     gain: Positive
     leader: BodyName
+    is_place: ClassVar[bool] = False
+    suspects: ClassVar[tuple[str, ...]] = ("gain", "leader")
 
     @property
     def required(self) -> tuple[str, ...]:
@@ -229,6 +253,7 @@ class OrbitConfig(_Task):
 
     kind: Literal["orbit"] = "orbit"
     rate: Number
+    suspects: ClassVar[tuple[str, ...]] = ("rate",)
 
     def build(self, bodies: Sequence[str]) -> Task:
         """The `OrbitTask` with these values."""
@@ -250,6 +275,7 @@ class PatrolConfig(_Task):
     gain: Positive
     rate: Number
     harmonics: Annotated[int, Field(strict=True, ge=1)] = 1
+    suspects: ClassVar[tuple[str, ...]] = ("gain", "rate", "harmonics")
 
     @property
     def parameters(self) -> int:
