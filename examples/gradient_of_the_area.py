@@ -1,0 +1,5 @@
+# %% [markdown]
+# # gradient_of_the_area
+
+# %%
+print(1)

@@ -1,0 +1,5 @@
+# %% [markdown]
+# # log_to_set
+
+# %%
+print(1)
