@@ -1,5 +1,0 @@
-# %% [markdown]
-# # log_to_set
-
-# %%
-print(1)
