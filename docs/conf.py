@@ -17,7 +17,7 @@ author = "torchfsid developers"
 copyright = author
 version = release = installed_version("torchfsid")
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "config_reference", "docstrings"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "config_reference", "docstrings", "results_files"]
 exclude_patterns = ["_build", "_ext", "conf.py", "notebooks/data"]
 
 # Links: a name, page or heading that is not there is an error. Names of other libraries are not looked up, so that the
