@@ -18,12 +18,18 @@ copyright = author
 version = release = installed_version("torchfsid")
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "config_reference", "docstrings", "results_files"]
-exclude_patterns = ["_build", "_ext", "conf.py", "notebooks/data"]
+exclude_patterns = ["_build", "_ext", "_static", "conf.py", "notebooks/data"]
 
 # Links: a name, page or heading that is not there is an error. Names of other libraries are not looked up, so that the
 # build needs no network.
 nitpicky = True
-INTERNAL = ("config", "identification.safety_parameters", "logs.reading", "robots.avoidance", "robots.unknown_avoidance")
+INTERNAL = (
+    "config",
+    "identification.safety_parameters",
+    "logs.reading",
+    "robots.avoidance",
+    "robots.unknown_avoidance",
+)
 nitpick_ignore_regex = [(r"py:.*", r"(?!torchfsid).*"), (r"py:.*", rf"torchfsid\.({'|'.join(INTERNAL)})\..*")]
 myst_heading_anchors = 4
 myst_enable_extensions = ["deflist"]
@@ -49,6 +55,7 @@ napoleon_use_ivar = True
 html_theme = "furo"
 html_title = f"torchfsid {release}"
 html_copy_source = False
+html_static_path, html_css_files = ["_static"], ["wide.css"]
 
 
 def _take_notebooks(app: Sphinx) -> None:

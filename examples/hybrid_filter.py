@@ -1,7 +1,7 @@
 """A filter kept honest by a set: the hybrid observer projects the filter's estimate onto what is possible.
 
-Two robots meet head on, and while each holds the other back their motion says little about their goals: the filter stands
-still, the set shrinks all the same.
+Two robots meet head on. While each holds the other back, their motion says little about their goals: the filter is far
+off, and the set tells how far it can be.
 """
 
 import torch

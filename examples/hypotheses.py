@@ -35,5 +35,8 @@ for measurement in log.measurements(robots, ["current"]):
 
 for name, observer in observers.items():
     refuted = {event.robot: event.t for event in observer.events if event.status.name == "INCONSISTENT"}
-    said = [f"{robot} refuted at {refuted[i]:.2f} s" if i in refuted else f"{robot} possible" for i, robot in enumerate(robots)]
+    said = [
+        f"{robot} refuted at {refuted[i]:.2f} s" if i in refuted else f"{robot} possible"
+        for i, robot in enumerate(robots)
+    ]
     print(f"{name:20s}", "; ".join(said))

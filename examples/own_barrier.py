@@ -16,16 +16,16 @@ def z(seen):
     return seen.x - VELOCITY * torch.as_tensor(seen.t).reshape(-1, 1)
 
 
-def A(seen):  # (B, 1, 2): one row for each robot
+def normals(seen):  # A, (B, 1, 2): one row for each robot
     return -2 * (z(seen) @ P).unsqueeze(-2)
 
 
-def b(seen):  # (B, 1)
+def offsets(seen):  # b, (B, 1)
     h = ((z(seen) @ P) * z(seen)).sum(-1) - 1
     return (GAMMA * h - 2 * (z(seen) @ P) @ VELOCITY).unsqueeze(-1)
 
 
-ellipse = fsid.AffineBarrier(A, b, names=("ellipse",), depends_on_bodies=False)
+ellipse = fsid.AffineBarrier(normals, offsets, names=("ellipse",), depends_on_bodies=False)
 
 task, barriers = fsid.GoalTask(gain=1.0), [ellipse, fsid.SpeedBox((1.0, 1.0))]
 start = torch.tensor([[-2.0, -0.1], [0.3, 2.0]])

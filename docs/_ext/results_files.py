@@ -1,4 +1,4 @@
-"""`{results-files}`: the files that each kind of experiment writes, from the table that the experiments themselves use."""
+"""`{results-files}`: the files that each kind of experiment writes, from the table that experiments themselves use."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """The log of the examples, crossing.csv: four robots and a pillar, simulated with the seed below. Run it to remake it.
 
-The robots go to goals with the gain 0.8 /s, keep 0.5 m from every body by one QP for the team, and drive at most 0.8 m/s
-along each axis. Every logged velocity is wrong by up to 4 mm/s in a random direction.
+The robots go to goals with the gain 0.8 /s, keep 0.5 m from every body by one QP for the team, and drive at most
+0.8 m/s along each axis. Every logged velocity is wrong by up to 4 mm/s in a random direction.
 """
 
 from __future__ import annotations

@@ -131,10 +131,12 @@ class FeasibleSet:
 
     @property
     def dim(self) -> int:
+        """p, the number of entries of theta."""
         return self.body.A.shape[-1]
 
     @property
     def is_empty(self) -> Bool[Tensor, "*batch"]:
+        """Is there a proof that the set is empty?"""
         return self.outcome == Status.EMPTY
 
     @cached_property
