@@ -15,6 +15,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic.fields import FieldInfo
+from pydantic.json_schema import SkipJsonSchema
 from pydantic_core import PydanticUndefined
 
 from experiments.kinds import KINDS
@@ -97,10 +98,15 @@ def _models(annotation: Any, several: str = "") -> Iterator[tuple[type[Strict], 
     """The sections within an annotation, each with [] if there is a list of them, or .NAME for a mapping."""
     if isinstance(annotation, type) and issubclass(annotation, Strict):
         yield annotation, several
-    elif get_origin(annotation) is not Literal:
+    elif get_origin(annotation) is not Literal and not _is_hidden(annotation):
         within = {tuple: "[]", dict: ".NAME"}.get(get_origin(annotation), "")
         for part in get_args(annotation):
             yield from _models(part, several + within)
+
+
+def _is_hidden(annotation: Any) -> bool:
+    """Is this an object of Python, which a file cannot hold?"""
+    return any(isinstance(part, SkipJsonSchema) for part in getattr(annotation, "__metadata__", ()))
 
 
 def _values(annotation: Any, metadata: Any = ()) -> str:
@@ -110,7 +116,9 @@ def _values(annotation: Any, metadata: Any = ()) -> str:
     if origin is Literal:
         return ", ".join(f"`{str(part).lower() if isinstance(part, bool) else part}`" for part in parts)
     if origin in (Union, UnionType):
-        return " or ".join(dict.fromkeys(_values(part) for part in parts if part is not NoneType))
+        return " or ".join(
+            dict.fromkeys(_values(part) for part in parts if part is not NoneType and not _is_hidden(part))
+        )
     if origin is tuple:
         limits = _limits(metadata)
         least, most = limits.get("min_length"), limits.get("max_length")
