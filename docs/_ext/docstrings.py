@@ -6,6 +6,7 @@ A bar, a star or an underscore at the end of a word has a meaning in reStructure
 
 from __future__ import annotations
 
+import inspect
 import re
 
 from sphinx.application import Sphinx
@@ -41,12 +42,15 @@ def _convert(app: Sphinx, what: str, name: str, subject: object, options: object
         lines[:] = as_rst(lines)
 
 
-def _types_as_code(app: Sphinx, what: str, name: str, subject: object, options: object, lines: list[str]) -> None:
-    """Shapes such as `*batch m`, which napoleon takes from annotations, are code."""
+def _correct(app: Sphinx, what: str, name: str, subject: object, options: object, lines: list[str]) -> None:
+    """Shapes such as `*batch m`, which napoleon takes from annotations, are code; a property's text is no type."""
     lines[:] = [re.sub(r"^(:vartype \w+: )(.+)$", r"\1``\2``", line.replace("jaxtyping.", "")) for line in lines]
+    told = inspect.getdoc(subject) or ""
+    if what == "property" and "Raises:" not in told:
+        lines[:] = as_rst(told.splitlines())
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
     app.connect("autodoc-process-docstring", _convert, priority=400)  # before napoleon
-    app.connect("autodoc-process-docstring", _types_as_code, priority=600)  # after it
+    app.connect("autodoc-process-docstring", _correct, priority=600)  # after it
     return {"parallel_read_safe": True}
