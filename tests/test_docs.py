@@ -69,6 +69,7 @@ def test_configurations_are_valid(page: Path, tmp_path: Path) -> None:
         assert load_models(file)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_first_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Its commands do what the page says."""
     shutil.copytree(ROOT / "examples" / "data", tmp_path / "examples" / "data")
