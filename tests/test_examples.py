@@ -15,7 +15,8 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 SCRIPTS = sorted(EXAMPLES.glob("*.py"))
 
 
-def test_they_are_read_at_once() -> None:
+def test_there_are_eight_that_are_read_at_once() -> None:
+    assert len(SCRIPTS) == 8
     for script in SCRIPTS:
         assert 30 <= len(script.read_text().splitlines()) <= 60, script.name
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import inspect
 import re
-import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
 from types import NoneType, UnionType
@@ -22,6 +21,7 @@ from experiments.kinds import KINDS
 from experiments.teams import TeamConfig
 from torchfsid.config.documents import Strict
 from torchfsid.config.observe import ObserveConfig
+from torchfsid.config.schema import descriptions
 
 CHOSEN_BY = ("kind", "order")
 """Keys that choose among the forms of a section."""
@@ -67,7 +67,7 @@ def sections(
     if model in known:
         return
     known.add(model)
-    told = _attributes(model)
+    told = descriptions(model)
     form = _form(model)
     keys = tuple(
         Key(name, _values(field.annotation, field.metadata), _default(field), told.get(name, "") or _chosen(name, form))
@@ -167,25 +167,6 @@ def _default(field: FieldInfo) -> str:
 def _opening(model: type[Strict]) -> str:
     """What a docstring says before its attributes."""
     return inspect.cleandoc(model.__doc__ or "").split("Attributes:")[0].strip()
-
-
-def _attributes(model: type[Strict]) -> dict[str, str]:
-    """The meaning of each key, from the `Attributes:` of a model and its bases."""
-    found: dict[str, str] = {}
-    for base in reversed(model.__mro__):
-        if issubclass(base, Strict) and base is not Strict and "Attributes:" in (base.__doc__ or ""):
-            text = textwrap.dedent(inspect.cleandoc(base.__doc__ or "").split("Attributes:")[1])
-            for name, meaning in re.findall(r"^(\w+): (.*(?:\n(?: +.*|$))*)", text, re.MULTILINE):
-                found[name] = " ".join(meaning.split())
-    return found
-
-
-def experiment_sections() -> Iterator[Section]:
-    """The sections of all kinds of files of `experiments`, each once, without those of observe files."""
-    known = {section.model for section in sections(ObserveConfig)}
-    for kind in KINDS.values():
-        yield from sections(kind.config, known=known)
-    yield from sections(TeamConfig, "experiment.team", known=known)
 
 
 def label(model: type[Strict]) -> str:
