@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import sys
-from importlib.metadata import version as installed_version
 from pathlib import Path
 
 from sphinx.application import Sphinx
@@ -12,10 +11,12 @@ from sphinx.application import Sphinx
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE / "_ext"), str(HERE.parent)]
 
+import torchfsid  # noqa: E402 after the path that leads to it
+
 project = "torchfsid"
 author = "torchfsid developers"
 copyright = author
-version = release = installed_version("torchfsid")
+version = release = torchfsid.__version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "config_reference", "docstrings", "results_files"]
 exclude_patterns = ["_build", "_ext", "_static", "conf.py", "notebooks/data"]

@@ -169,6 +169,14 @@ def _opening(model: type[Strict]) -> str:
     return inspect.cleandoc(model.__doc__ or "").split("Attributes:")[0].strip()
 
 
+def experiment_sections() -> Iterator[Section]:
+    """The sections of all kinds of files of `experiments`, each once, without those of observe files."""
+    known = {section.model for section in sections(ObserveConfig)}
+    for kind in KINDS.values():
+        yield from sections(kind.config, known=known)
+    yield from sections(TeamConfig, "experiment.team", known=known)
+
+
 def label(model: type[Strict]) -> str:
     """The label of a model's section in these pages."""
     return f"config-{model.__name__}"
