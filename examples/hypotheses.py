@@ -8,9 +8,8 @@ from pathlib import Path
 import torch
 
 import torchfsid as fsid
-from torchfsid.logs.read import read_log
 
-log = read_log(Path(__file__).parent / "data" / "crossing.csv")
+log = fsid.read_log(Path(__file__).parent / "data" / "crossing.csv")
 robots = [body for body in log.bodies if body != "pillar"]
 barriers = [
     fsid.CollisionAvoidance(fsid.ClassK(2.0), safety_distance=0.5, neighbour_velocity="current"),
@@ -34,7 +33,7 @@ for measurement in log.measurements(robots, ["current"]):
         observer.update(measurement)
 
 for name, observer in observers.items():
-    refuted = {event.robot: event.t for event in observer.events if event.status.name == "INCONSISTENT"}
+    refuted = {event.robot: event.t for event in observer.events if event.status == fsid.Status.INCONSISTENT}
     said = [
         f"{robot} refuted at {refuted[i]:.2f} s" if i in refuted else f"{robot} possible"
         for i, robot in enumerate(robots)

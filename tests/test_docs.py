@@ -88,7 +88,8 @@ def test_every_public_name_is_described() -> None:
     reference = "".join(page.read_text() for page in (DOCS / "reference").glob("*.md"))
     for name in torchfsid.__all__:
         value = getattr(torchfsid, name)
-        assert re.search(rf"auto(class|function):: torchfsid\.{name}$", reference, re.MULTILINE), name
+        of_module = f"|automodule:: {re.escape(value.__module__)}"
+        assert re.search(rf"(auto(class|function):: torchfsid\.{name}{of_module})$", reference, re.MULTILINE), name
         assert undescribed(value, name) == []
 
 
