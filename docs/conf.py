@@ -25,6 +25,7 @@ exclude_patterns = ["_build", "_ext", "_static", "conf.py", "notebooks/data"]
 # build needs no network.
 nitpicky = True
 INTERNAL = (
+    "commands",
     "config",
     "identification.safety_parameters",
     "logs.reading",
