@@ -34,7 +34,12 @@ if TYPE_CHECKING:
 
 
 class UnknownClassKConfig(Strict):
-    """`ClassKConfig` whose gain may be unknown within [low, high]."""
+    """`ClassKConfig` whose gain may be unknown within [low, high].
+
+    Attributes:
+        gain: gain of alpha, a number or bounds [low, high]. Its unit makes alpha(h) a rate of h: [1/s] with power 1.
+        power: exponent of alpha.
+    """
 
     gain: PositiveOrInterval
     power: Positive = 1.0
@@ -46,7 +51,12 @@ class UnknownClassKConfig(Strict):
 
 
 class ClassKConfig(Strict):
-    """`ClassK`: alpha(h) = gain sign(h) |h|^power."""
+    """`ClassK`: alpha(h) = gain sign(h) |h|^power.
+
+    Attributes:
+        gain: gain of alpha. Its unit makes alpha(h) a rate of h: [1/s] with power 1.
+        power: exponent of alpha.
+    """
 
     gain: Positive
     power: Positive = 1.0

@@ -28,14 +28,22 @@ if TYPE_CHECKING:
 
 
 class NormSaturationConfig(Strict):
-    """Norm saturation: |uhat| <= limit [m/s]."""
+    """Norm saturation: |uhat| <= limit [m/s].
+
+    Attributes:
+        limit: the largest speed [m/s].
+    """
 
     kind: Literal["norm"] = "norm"
     limit: Positive
 
 
 class BoxSaturationConfig(Strict):
-    """Box saturation: |uhat_i| <= limit_i [m/s] on each axis."""
+    """Box saturation: |uhat_i| <= limit_i [m/s] on each axis.
+
+    Attributes:
+        limit: the largest speed along each axis [m/s].
+    """
 
     kind: Literal["box"] = "box"
     limit: PlanarVector
@@ -224,7 +232,12 @@ class VelocityConfig(_Task):
 
 
 class FormationConfig(_Task):
-    """`FormationTask`: keep an offset to the body `leader`, with a known gain [1/s]."""
+    """`FormationTask`: keep an offset to the body `leader`, with a known gain [1/s].
+
+    Attributes:
+        gain: gain of the nominal control [1/s].
+        leader: the body whose position the offset is added to.
+    """
 
     kind: Literal["formation"] = "formation"
     gain: Positive
@@ -249,7 +262,11 @@ class FormationConfig(_Task):
 
 
 class OrbitConfig(_Task):
-    """`OrbitTask`: circle a centre at a known rate [rad/s], positive if anticlockwise."""
+    """`OrbitTask`: circle a centre at a known rate [rad/s], positive if anticlockwise.
+
+    Attributes:
+        rate: angular rate [rad/s], positive if anticlockwise.
+    """
 
     kind: Literal["orbit"] = "orbit"
     rate: Number

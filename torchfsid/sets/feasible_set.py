@@ -44,9 +44,9 @@ class FeasibleSet:
     `torch.func.vmap` does not run over sets: searches look at the numbers. The layers of `programmes` take sets, too.
 
     Attributes:
-        body: the sets with the batch flattened, a `Polygon` for p = 2, a `Polyhedron` for p = 3, else a `Polytope`.
+        body: the sets with the batch flattened, a `Polygon` for p = `dim` = 2, a `Polyhedron` for 3, else a `Polytope`.
         batch_shape: the shape of the batch.
-        outcome: a `Status` per item. An EMPTY item contains nothing and stays empty, whatever its body.
+        outcome: a `Status` per item, EMPTY where `is_empty`: it contains nothing and stays so, whatever its body.
         contradiction: the rows that no parameter satisfies together, for EMPTY items.
         last_cut: the time of the intersection that last shrank the set [s]; NaN if there was none.
         max_facets: the largest number of facets that are kept.
