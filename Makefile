@@ -1,5 +1,6 @@
 # make demo    one experiment of the paper, with its figures       make test    every check and every test
 # make lint    the static checks alone                             make clean   removes what the others made
+# make docs    the pages, in docs/_build/html; a warning is an error
 # make dist    wheel and sdist in dist/, tried in a clean environment outside the checkout
 #
 # Each target does its own set-up: a virtual environment in .venv, pinned by constraints.txt. It needs Python >= 3.11.
@@ -11,6 +12,7 @@ PYTHON ?= $(shell for p in python3.11 python3; do \
 
 BIN := .venv/bin
 STAMP := .venv/installed
+DOCS_STAMP := .venv/docs-installed
 PIP_OPTIONS := --disable-pip-version-check $(if $(MAKE_TERMOUT),,--quiet)
 
 DEMO := configs/two_pairs.yaml
@@ -19,7 +21,7 @@ DEMO_OUT := results/two_pairs
 # Small tensors: with two threads torch is 7 to 20 times slower than with one.
 export OMP_NUM_THREADS := 1
 
-.PHONY: demo test lint dist clean
+.PHONY: demo test lint docs dist clean
 
 demo: $(STAMP)
 	$(BIN)/python -m experiments run $(DEMO) --out $(DEMO_OUT)
@@ -33,6 +35,10 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/pyright
+
+docs: $(DOCS_STAMP)
+	$(BIN)/python -m sphinx -b html -E -W --keep-going --quiet docs docs/_build/html
+	@echo "The pages are in docs/_build/html/index.html"
 
 # The wheel is built from the sdist, so both are tried.
 dist: $(STAMP)
@@ -51,5 +57,9 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/pip install $(PIP_OPTIONS) -c constraints.txt -e '.[dev]'
 	@touch $@
 
+$(DOCS_STAMP): $(STAMP)
+	$(BIN)/pip install $(PIP_OPTIONS) -c constraints.txt -e '.[docs]'
+	@touch $@
+
 clean:
-	rm -rf .venv dist results .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf .venv dist results docs/_build docs/notebooks .pytest_cache .ruff_cache .import_linter_cache .hypothesis

@@ -28,3 +28,4 @@ def unchecked() -> Iterator[None]:
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures are laid out and drawn in seconds, which is tested elsewhere: here they are files of one byte."""
     monkeypatch.setattr(Figure, "savefig", lambda figure, file, **options: file.write(b"."))
+    monkeypatch.setattr(Figure, "draw_without_rendering", lambda figure: None)

@@ -16,9 +16,9 @@ from rich.markup import escape
 
 import experiments.__main__
 import torchfsid.cli
+from torchfsid.commands.clock import seconds
 from torchfsid.commands.command_line import execute
 from torchfsid.commands.interruption import uninterrupted
-from torchfsid.commands.results import seconds
 from torchfsid.commands.results_folder import ResultsFolder
 from torchfsid.commands.terminal import aside, console, digits, status, table, track
 from torchfsid.errors import ConfigError, LogError
@@ -258,7 +258,7 @@ def test_without_a_command_the_commands_are_named(
         main([])
     error = capsys.readouterr().err
     assert error.count("\n") == 1
-    assert "{observe,check}" in error or "{run,sweep,design,figures}" in error
+    assert "{init,observe,check,schema,report}" in error or "{run,sweep,design,figures,report}" in error
 
 
 @pytest.mark.parametrize("stream", ["stdout", "stderr"])

@@ -71,7 +71,7 @@ def test_auto_does_not_end_with_a_bare_ok_on_a_wrong_model(
     said = capsys.readouterr().out
     assert said.count("ok (bound useless)") == 3
     assert "Warning:" in said
-    assert "suspect a wrong kind of controller" in said
+    assert "suspect barriers.0.neighbour_velocity: current instead of none" in said
     assert {region["status"] for region in regions["robots"].values()} == {"ok"}
     found = json.loads((tmp_path / "out" / "velocity_bound.json").read_text())
     assert regions["bound"]["useless"] is found["useless"] is True

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from torchfsid.identification.evidence import evidence as evidence
     from torchfsid.identification.inverse_optimal import inverse_optimal_set as inverse_optimal_set
     from torchfsid.identification.kkt import solve_kkt as solve_kkt
+    from torchfsid.kernels.threads import get_num_threads as get_num_threads
+    from torchfsid.kernels.threads import set_num_threads as set_num_threads
     from torchfsid.logs.log import Log as Log
     from torchfsid.observers.fleet import FleetObserver as FleetObserver
     from torchfsid.observers.hybrid import HybridEstimate as HybridEstimate
@@ -85,6 +87,7 @@ _HOME = {
     "identification.evidence": ["Evidence", "ObservationModel", "evidence"],
     "identification.inverse_optimal": ["inverse_optimal_set"],
     "identification.kkt": ["solve_kkt"],
+    "kernels.threads": ["get_num_threads", "set_num_threads"],
     "logs.log": ["Log"],
     "observers.fleet": ["FleetObserver"],
     "observers.hybrid": ["HybridEstimate", "HybridObserver"],

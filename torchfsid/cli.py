@@ -40,16 +40,20 @@ statuses, one per robot:
   inconsistent   no parameter of the prior explains all that was seen: model, prior or bound is wrong, or the robot
                  changed its task. Contradicting rows and times are in regions.json
 
-exit codes: 0 done, whatever the statuses are; 1 failed after it began to write; 2 nothing was written; 128 + signal
+A set whose status is not ok is not to be trusted. A status is a result and no failure: scripts read it in regions.json.
+
+exit codes: 0 done, even if no set can be trusted; 1 failed after it began to write; 2 nothing was written; 128 + signal
 """
 
 CHECKED = """\
 prints, for each robot, the smallest bound on the errors of its commands with which the model explains its motion,
-beside the declared bound and the speeds seen; the samples and rows that contradict the model most; whether shifted
-velocities would fit better. A small bound is no proof of the model, but one near the speeds seen disproves it.
+beside the declared bound and the speeds seen; the samples and rows that contradict the model most; the key to suspect,
+or whether shifted velocities would fit better. A small bound is no proof of the model, but one near the speeds seen
+disproves it. The exit code is 0 for any answer.
 
-example:
+examples:
   torchfsid check run.csv --config config.yaml --set task.gain=0.11 --set barriers.0.safety_distance=0.2
+  torchfsid check run.csv --config config.yaml --scan task.gain=0.05:0.2 --out scan
 """
 
 STARTED = """\
@@ -96,7 +100,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="the run as ROS 2 messages, for Foxglove, RViz, rerun (docs/mcap.md)",
     )
     observe.add_argument("--merge", action="store_true", help="copy the messages of LOG, a bag, into FILE.mcap")
-    check.add_argument("--out", type=Path, help="folder for check.json")
+    check.add_argument("--out", type=Path, help="folder for check.json, or for scan.csv, scan.json and scan.png")
+    check.add_argument(
+        "--scan",
+        metavar="KEY=LOW:HIGH[:N]",
+        help="instead: the smallest bound that explains the log over N values of a key, e.g. task.gain=0.05:0.2",
+    )
     report = commands.add_parser("report", help="write report.html of a results folder: a page that opens offline")
     report.add_argument("out", type=Path, metavar="DIR", help="results folder of observe")
     commands.metavar = f"{{{','.join(commands.choices)}}}"  # so that a message about a missing command names them
@@ -115,7 +124,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         results = ResultsFolder(chosen.out, None)
         return execute("torchfsid", lambda: _report(results), results)
     anywhere = None if chosen.out is None else ResultsFolder(chosen.out, None)
-    return execute("torchfsid", lambda: _check(chosen.log, chosen.config, anywhere, chosen.set), anywhere)
+    return execute("torchfsid", lambda: _check(chosen.log, chosen.config, anywhere, chosen.set, chosen.scan), anywhere)
 
 
 def _init(log: Path, out: Path) -> None:
@@ -146,7 +155,7 @@ def _observe(chosen: argparse.Namespace, folder: ResultsFolder) -> None:
     observe_log(chosen.log, models, folder, chosen.report, chosen.mcap, chosen.merge)
 
 
-def _check(log: Path, config: Path, folder: ResultsFolder | None, overrides: Sequence[str]) -> None:
+def _check(log: Path, config: Path, folder: ResultsFolder | None, overrides: Sequence[str], values: str | None) -> None:
     with importing():
         from torchfsid.config.models import load_models
 
@@ -155,9 +164,13 @@ def _check(log: Path, config: Path, folder: ResultsFolder | None, overrides: Seq
     models = load_models(config, overrides)
 
     with importing():
-        from torchfsid.commands.on_logs import check_log
+        from torchfsid.commands.on_logs import check_log, scan_log
+        from torchfsid.commands.scan import Range
 
-    check_log(log, models, folder)
+    if values is None:
+        check_log(log, models, folder)
+    else:
+        scan_log(log, models, folder, Range.parse(values))
 
 
 def _report(folder: ResultsFolder) -> None:

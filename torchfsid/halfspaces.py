@@ -73,14 +73,17 @@ class Halfspaces:
 
     @property
     def batch_shape(self) -> torch.Size:
+        """The shape of the batch."""
         return self.b.shape[:-1]
 
     @property
     def rows(self) -> int:
+        """m, the number of rows, padding included."""
         return self.b.shape[-1]
 
     @property
     def dim(self) -> int:
+        """n, the number of entries of z."""
         return self.A.shape[-1]
 
     def pullback(self, G: Float[Tensor, "*batch n p"], f: Float[Tensor, "*batch n"]) -> Halfspaces:

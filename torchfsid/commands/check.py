@@ -11,45 +11,28 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import torch
 from torch import Tensor
 
+from torchfsid.commands.alternatives import Alternative, best_alternative
 from torchfsid.commands.check_safety import SafetyCheck, check_safety
+from torchfsid.commands.clock import Clock
 from torchfsid.commands.declared_log import AUTO_FACTOR, LARGEST_OF, DeclaredLog
+from torchfsid.commands.faults import Fault, Faults
 from torchfsid.commands.judged_bound import SUSPECTS, JudgedBound
 from torchfsid.commands.narrowing import Narrowing, narrowed
-from torchfsid.commands.results import constraint_name, seconds
 from torchfsid.logs.commanded import Recovery
-from torchfsid.observers.consistency import Consistency, Fit
+
+CONTROLS = {"velocity": "velocities", "acceleration": "accelerations"}
+"""What controls are called."""
 
 SHIFTS = (-2, -1, 1, 2)
 """Misalignments of controls and positions that are looked for [samples]."""
 
+MUCH_BETTER = 0.5
+"""A misalignment is suspected if another alignment needs less than this fraction of the bound."""
+
 BETTER = 0.8
-"""Another alignment is better if it needs less than this fraction of the bound."""
-
-
-@dataclass(frozen=True)
-class Fault:
-    """Samples of a robot that contradict the declared bounds because of one row of the model.
-
-    Attributes:
-        row: label of the row.
-        soft: the controller may violate the row.
-        samples: number of such samples.
-        first: time of the first [s].
-        worst: largest amount by which a bound is exceeded, in units of the controls.
-    """
-
-    row: str
-    soft: bool
-    samples: int
-    first: float
-    worst: float
-
-    def to_json(self) -> dict:
-        """The entry of `check.json`."""
-        return {**vars(self), "worst": _finite(self.worst)}
+"""The same, of what the best change of a key needs: wrong keys often look like a shift."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +75,8 @@ class Check:
         is_auto: the configuration says `auto`.
         fastest: the largest control in the log.
         bound: the larger of the declared and the smallest bound, judged by the controls seen.
+        alternative: the change of one key with which the log needs a much smaller bound, if there is one.
+        clock: how times are shown.
         shifts: number of samples by which controls are taken later, to the `smallest_bound` then. It is infinite if it
             is not below that without a shift.
         safety: what the log says about gain and safety distance. None where that is not asked.
@@ -106,6 +91,8 @@ class Check:
     is_auto: bool
     fastest: float
     bound: JudgedBound
+    alternative: Alternative | None
+    clock: Clock
     shifts: dict[int, float]
     safety: SafetyCheck | None
     as_commanded: bool
@@ -126,7 +113,8 @@ class Check:
     def best_shift(self) -> int:
         """The number of samples by which later controls fit clearly better. 0: no shift does."""
         best = min(self.shifts, key=lambda shift: self.shifts[shift])
-        return best if self.shifts[best] < BETTER * self.smallest_bound else 0
+        rival = math.inf if self.alternative is None else BETTER * self.alternative.bound
+        return best if self.shifts[best] < min(MUCH_BETTER * self.smallest_bound, rival) else 0
 
     def conclusions(self) -> list[str]:
         """The conclusions as sentences, with remedies."""
@@ -136,20 +124,15 @@ class Check:
         if len(silent) == len(self.robots):
             return lines
         lines += [] if self.narrowing is None else self.narrowing.said()
-        lines.append(self._fit())
-        controls = {"velocity": "velocities", "acceleration": "accelerations"}[self.quantity]
+        lines += [self._fit(), *([] if self._suggestion is None else [self._suggestion])]
+        controls = CONTROLS[self.quantity]
         if len(self.shifts) == 1:
             lines.append(f"nothing can be said of the alignment of {controls} and positions: the log is too short")
-        elif self.best_shift:
-            later = "later" if self.best_shift > 0 else "earlier"
-            lines.append(
-                f"{controls} logged {abs(self.best_shift)} sample(s) {later} fit better: "
-                f"{self.shifts[self.best_shift]:.3g} {self.unit} suffices; positions and {controls} may be misaligned"
-            )
-        else:
-            lines.append(f"{controls} and positions are aligned: no shift by 1 or 2 samples fits better")
+        elif not self.best_shift:
+            lines.append(f"{controls} and positions are aligned: no shift by 1 or 2 samples fits much better")
         if self.bound.is_useless and not self._unexplained:
-            lines.append(self.bound.warning(is_needed=self.bound.bound <= AUTO_FACTOR * self.smallest_bound))
+            is_needed = self.bound.bound <= AUTO_FACTOR * self.smallest_bound
+            lines.append(self.bound.warning(is_needed, is_explained=self._suggestion is not None))
         if self.as_commanded and (self.bound.is_useless or self._unexplained):
             lines.append(
                 "velocities are differences of positions, which are no commands where robots cannot move sideways: if "
@@ -162,11 +145,27 @@ class Check:
             if faults:
                 first = min(faults, key=lambda fault: fault.first)
                 most = max({fault.row for fault in faults}, key=lambda row: _count(faults, row))
+                look_at = "" if self._suggestion else f": {next(f.look_at for f in faults if f.row == most)}"
                 lines.append(
-                    f"{name} at {self.declared:.3g} {self.unit}: {_count(faults)}, the first at {seconds(first.first)} "
-                    f"({first.row}), most by {most} ({_count(faults, most)})"
+                    f"{name} at {self.declared:.3g} {self.unit}: {_count(faults)}, the first at "
+                    f"{self.clock(first.first)} ({first.row}), most by {most} ({_count(faults, most)}){look_at}"
                 )
-        return lines if self.safety is None else [*lines, self.safety.conclusion()]
+        lines += [] if self.safety is None else [self.safety.conclusion()]
+        if self.smallest_bound <= self.declared:
+            lines.append("consistent: no contradiction was seen. That is no proof of the model")
+        return [*lines, *self.clock.sentence()]
+
+    @property
+    def _suggestion(self) -> str | None:
+        """The likeliest cause if the log does not fit the declared model well."""
+        if self.best_shift:
+            later = "later" if self.best_shift > 0 else "earlier"
+            controls = CONTROLS[self.quantity]
+            return (
+                f"{controls} logged {abs(self.best_shift)} sample(s) {later} fit better: "
+                f"{self.shifts[self.best_shift]:.3g} {self.unit} suffices; positions and {controls} may be misaligned"
+            )
+        return None if self.alternative is None else self.alternative.sentence(self.unit)
 
     @property
     def _unexplained(self) -> list[str]:
@@ -202,6 +201,7 @@ class Check:
             "bound": {"judged": self.bound.bound, **self.bound.to_json()},
             "best_shift": self.best_shift,
             "shifts": {str(shift): _finite(bound) for shift, bound in sorted(self.shifts.items())},
+            "alternative": None if self.alternative is None else vars(self.alternative),
             "conclusions": self.conclusions(),
             "safety": None if self.safety is None else self.safety.to_json(),
             "unknown_numbers": None if self.narrowing is None else self.narrowing.to_json(),
@@ -244,7 +244,7 @@ def check(declared: DeclaredLog) -> Check:
 
     sets = consistency.sets(enough)
     residuals = consistency.residuals(sets, fastest)
-    faults = _Faults(declared.row_labels, consistency, sets, bound, residuals)
+    faults = Faults(declared.row_labels, declared.where_to_look, consistency, sets, bound, residuals)
     robots = []
     for i, robot in enumerate(declared.robots):
         of_robot = residuals[:, i]
@@ -264,6 +264,7 @@ def check(declared: DeclaredLog) -> Check:
                 violations=faults.violations(i),
             )
         )
+    alternative = best_alternative(declared, overall) if any(robot.samples for robot in robots) else None
     is_auto, safety = noise.control == "auto", check_safety(declared)
     config = declared.config
     as_commanded = config.velocity == "differentiated" and config.body is None and not config.is_second_order
@@ -274,62 +275,14 @@ def check(declared: DeclaredLog) -> Check:
         is_auto=is_auto,
         fastest=fastest,
         bound=judged,
+        alternative=alternative,
+        clock=declared.clock,
         shifts=shifts,
         safety=safety,
         as_commanded=as_commanded,
         recovery=declared.recovery,
         narrowing=narrowing,
     )
-
-
-class _Faults:
-    """For all samples, at the declared bound: the row that a sample contradicts, and by how much."""
-
-    def __init__(self, labels: Sequence[str], consistency: Consistency, sets: Fit, bound: float, residuals: Tensor):
-        self.labels = labels
-        at_odds, blamed, excess, measured = [], [], [], []
-        for block in consistency.blocks:
-            reading = consistency.read(block, sets, block.repeated(torch.full_like(residuals[0], bound)))
-            # How far Theta is beyond each half-space, as a control: rows come from unit normals over the control.
-            corners = block.repeated(sets.theta.vertices())
-            beyond = (reading.omega.A @ corners.mT).amin(-1) - reading.omega.b
-            worst = beyond.argmax(-1, keepdim=True)
-            assert reading.omega.source is not None
-            blamed.append(reading.omega.source.gather(-1, worst).squeeze(-1))
-            at_odds.append(reading.informative)
-            excess.append(reading.excess)
-            measured.append(reading.informative | reading.alarmed)
-            self.hard = reading.hard
-        robots = residuals.shape[1]
-        self.times = torch.cat([block.times for block in consistency.blocks])
-        self.over = residuals - bound
-        self.at_odds = torch.cat(at_odds).unflatten(0, (-1, robots)) & (self.over > 0)
-        self.blamed = torch.cat(blamed).unflatten(0, (-1, robots))
-        self.excess = torch.cat(excess).unflatten(0, (-1, robots))
-        self.measured = torch.cat(measured).unflatten(0, (-1, robots))
-
-    def contradictions(self, robot: int) -> tuple[Fault, ...]:
-        over, blamed = self.over[:, robot], self.blamed[:, robot]
-        faults = []
-        for source in blamed[self.at_odds[:, robot]].unique().tolist():
-            at_odds = self.at_odds[:, robot] & (blamed == source)
-            hard = source % len(self.labels) if source < 2 * len(self.labels) else None
-            soft = hard is not None and not bool(self.hard[hard])
-            faults.append(self._fault(constraint_name(source, self.labels), soft, at_odds, over))
-        return tuple(faults)
-
-    def violations(self, robot: int) -> tuple[Fault, ...]:
-        faults = []
-        for row, label in enumerate(self.labels):
-            excess = self.excess[:, robot, row]
-            violated = self.measured[:, robot] & (excess > 0)
-            if bool(violated.any()):
-                faults.append(self._fault(label, not bool(self.hard[row]), violated, excess))
-        return tuple(faults)
-
-    def _fault(self, label: str, soft: bool, samples: Tensor, over: Tensor) -> Fault:
-        first = float(self.times[samples][0])
-        return Fault(label, soft, int(samples.sum()), first, float(over[samples].max()))
 
 
 def _count(faults: Sequence[Fault], row: str | None = None) -> int:

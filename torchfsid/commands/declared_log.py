@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -11,8 +11,11 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
+from torchfsid.commands.clock import Clock
 from torchfsid.commands.judged_bound import SUSPECTS, JudgedBound
+from torchfsid.commands.where_to_look import where_to_look
 from torchfsid.config.observe import ObserveConfig
+from torchfsid.config.quantities import require_body
 from torchfsid.config.unknown_numbers import replaced
 from torchfsid.errors import ConfigError
 from torchfsid.logs.commanded import Recovery, commanded
@@ -98,6 +101,8 @@ class DeclaredLog:
                 self.log = self.log.differentiated()
         self.log = bridged(self.log)
         self.robots = config.robots(self.log.bodies)
+        for robot in config.truth or {}:
+            require_body(f"truth.{robot}", robot, self.robots)
         self.task = config.task.build(self.log.bodies)
         self.barriers = config.build_barriers(self.log.bodies, self._radius)
         self.prior = config.prior.build(len(self.robots))
@@ -135,6 +140,16 @@ class DeclaredLog:
     def row_labels(self) -> list[str]:
         """A label for each row of the model."""
         return [label for barrier in self.barriers for label in barrier.labels(self.log.bodies)]
+
+    @property
+    def clock(self) -> Clock:
+        """How times of the log are shown."""
+        return Clock.of(float(self.log.t[0]))
+
+    def where_to_look(self, constraints: Iterable[str]) -> str:
+        """The keys of the configuration behind constraints that contradict each other."""
+        rows = [barrier.labels(self.log.bodies) for barrier in self.barriers]
+        return where_to_look(constraints, self.config, rows)
 
     def measurements(self, block: int | None = None) -> Iterator[Measurement]:
         """The samples of the robots, in the order of time.
@@ -195,6 +210,15 @@ class DeclaredLog:
         """The same log and model with another bound on the error of controls."""
         other = copy(self)
         other.config = self.config.with_bound(bound)
+        return other
+
+    def with_model(self, config: ObserveConfig) -> DeclaredLog:
+        """The same log with another task, other barriers and another prior."""
+        other = copy(self)
+        other.config = config
+        other.task = config.task.build(self.log.bodies)
+        other.barriers = config.build_barriers(self.log.bodies, self._radius)
+        other.prior = config.prior.build(len(self.robots))
         return other
 
     def with_numbers(self, intervals: Sequence[tuple[float, float]]) -> DeclaredLog:

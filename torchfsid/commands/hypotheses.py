@@ -14,8 +14,9 @@ from pathlib import Path
 from torchfsid.commands.declared_log import DeclaredLog, automatic_bound
 from torchfsid.commands.judged_bound import JudgedBound
 from torchfsid.commands.observe import Observation
-from torchfsid.commands.results import STATUS_NAMES, constraint_name
+from torchfsid.commands.results import STATUS_NAMES
 from torchfsid.commands.results_folder import write_json
+from torchfsid.commands.where_to_look import constraint_name
 from torchfsid.outcome import Status
 
 

@@ -73,21 +73,23 @@ class JudgedBound:
             return "no motion was seen"
         return f"{self._percent} of the typical control seen, {self.typical:.3g} {self.unit}"
 
-    def warning(self, is_needed: bool) -> str:
+    def warning(self, is_needed: bool, is_explained: bool = False) -> str:
         """What is to be said of a useless bound.
 
         Args:
             is_needed: a much smaller bound would not explain the log.
+            is_explained: something else says what to suspect.
         """
         advice = (
             f"if the errors are not that large, suspect {SUSPECTS}" if is_needed else "declare a smaller one, or auto"
         )
         if self.differences > self.bound:
             advice = "most of it comes from differences of velocities: log accelerations, or more exact velocities"
+        end = "" if is_explained else f"; {advice}"
         total = self.bound + self.differences
         return (
             f"the bound {total:.3g} {self.unit} is useless: it is {self.compared()} (the largest: "
-            f"{self.largest:.3g}), so that a wrong model explains the log as well as the right one; {advice}"
+            f"{self.largest:.3g}), so that a wrong model explains the log as well as the right one{end}"
         )
 
     def cell(self, status: str, is_found: bool) -> str:

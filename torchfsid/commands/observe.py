@@ -5,19 +5,23 @@ from __future__ import annotations
 import csv
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 
 import torch
 
+from torchfsid.commands.alternatives import Alternative, best_alternative
 from torchfsid.commands.declared_log import AUTO_FACTOR, DeclaredLog, automatic_bound
 from torchfsid.commands.history import MotionFile
 from torchfsid.commands.judged_bound import JudgedBound
 from torchfsid.commands.narrowing import Narrowing, narrowed
-from torchfsid.commands.results import STATUS_NAMES, ResultsWriter, constraint_name, of_sets, seconds
+from torchfsid.commands.results import STATUS_NAMES, ResultsWriter, holds, of_sets
 from torchfsid.commands.run_in_mcap import RunInMcap
+from torchfsid.commands.where_to_look import constraint_name
 from torchfsid.config.observe import ObserveConfig
 from torchfsid.errors import FsidError, InconsistentError
 from torchfsid.identification.kkt import CASES
@@ -28,6 +32,9 @@ from torchfsid.observers.safety import SafetyObserver, SetObserver
 from torchfsid.observers.set_membership import SetEstimates, SetMembershipObserver
 from torchfsid.outcome import Status
 from torchfsid.robots.measurement import Measurement
+
+HARDLY_CUT = 0.5
+"""Share of its prior beyond which a set says little."""
 
 BLOCK = 1024
 """Samples that are read at once, at most."""
@@ -70,6 +77,7 @@ class Verdict:
         unexplained: number of samples that are left unexplained, at least: up to `outliers`.
         set_aside: the samples that may be these.
         status: `ok`, `alarm` or `inconsistent`, see `Status`.
+        holds_truth: whether the declared truth is in the set. None if there is none.
     """
 
     robot: str
@@ -86,6 +94,7 @@ class Verdict:
     unexplained: int
     set_aside: tuple[SetAside, ...]
     status: str
+    holds_truth: bool | None
 
 
 @dataclass
@@ -176,7 +185,30 @@ class Observation:
             needs_more = needs_more & (sets.unexplained == 0)
         return [robot for robot, strained in zip(self.robots, needs_more.tolist(), strict=True) if strained]
 
-    def run(self, out: Path, track: Track = iter, mcap: Path | None = None, bag: Path | None = None) -> None:
+    @cached_property
+    def alternative(self) -> Alternative | None:
+        """With `auto`: the change of one key with which the log needs a much smaller bound, if there is one.
+
+        The bound was then made for the model. A fixed bound would have been `strained`.
+        """
+        if self.smallest_bounds is None:
+            return None
+        return best_alternative(self.declared, max(self.smallest_bounds.values()))
+
+    def hardly_cut(self) -> list[str]:
+        """Robots that end `ok` with more than half of their prior: the log says little of them, with this bound."""
+        sets = self.sets
+        large = (sets.status == Status.OK) & (sets.feasible_set.volume() > HARDLY_CUT * sets.prior.volume())
+        return [robot for robot, is_large in zip(self.robots, large.tolist(), strict=True) if is_large]
+
+    def run(
+        self,
+        out: Path,
+        track: Track = iter,
+        made_from: Mapping[str, str] = MappingProxyType({}),
+        mcap: Path | None = None,
+        bag: Path | None = None,
+    ) -> None:
         """Observe the whole log. Write what `results` and `history` describe into the existing folder `out`.
 
         With unknown safety parameters the log is then read again (`second_look`), for the sets of regions.json.
@@ -184,6 +216,7 @@ class Observation:
         Args:
             out: the folder.
             track: shows how far it has come.
+            made_from: goes to regions.json, see `provenance`.
             mcap: a new file for the run as ROS messages (`run_in_mcap`). None: there is none.
             bag: a bag whose messages are copied into it. None: none are.
 
@@ -191,10 +224,16 @@ class Observation:
             FsidError: no parameter explains a robot, and `on_inconsistent` is `raise`. It names robot and rows.
             OSError: a file could not be written. The log was still observed to its end.
         """
-        bound, labels = {"used": self.bound_used, **self.bound.to_json()}, self.declared.row_labels
-        told = self.log.reading.to_json()
+        labels = self.declared.row_labels
+        told = {
+            "labels": labels,
+            "bound": {"used": self.bound_used, **self.bound.to_json()},
+            "log": self.log.reading.to_json(),
+            "truth": self.config.truth or {},
+            "made_from": made_from,
+        }
         with (
-            ResultsWriter(out, self.robots, self.sets, labels=labels, bound=bound, log=told) as results,
+            ResultsWriter(out, self.robots, self.sets, **told) as results,
             closing(MotionFile(out / "motion.csv", self.log, self.robots, labels)) as motion,
             nullcontext() if mcap is None else RunInMcap(mcap, self.declared, results.header, bag) as viewed,
         ):
@@ -238,13 +277,13 @@ class Observation:
 
     def _named(self, error: InconsistentError) -> str:
         """The error with the names of robot and rows."""
-        labels = self.declared.row_labels
+        labels, clock = self.declared.row_labels, self.declared.clock
         rows = [
-            constraint_name(source, labels) + ("" if math.isnan(time) else f" at {seconds(time)}")
+            constraint_name(source, labels) + ("" if math.isnan(time) else f" at {clock(time)}")
             for time, source in error.rows
         ]
         return (
-            f"robot {self.robots[error.robot]!r} at {seconds(error.t)}: no parameter explains the measurements; "
+            f"robot {self.robots[error.robot]!r} at {clock(error.t)}: no parameter explains the measurements; "
             f"these contradict each other: {', '.join(dict.fromkeys(rows))}"
         )
 
@@ -272,6 +311,11 @@ class Observation:
                 unexplained=unexplained[i],
                 set_aside=tuple(sample for sample in aside if sample.robot == i),
                 status=STATUS_NAMES[Status(int(self.sets.status[i]))],
+                holds_truth=self._holds_truth(i),
             )
             for i, robot in enumerate(self.robots)
         ]
+
+    def _holds_truth(self, i: int) -> bool | None:
+        theta = (self.config.truth or {}).get(self.robots[i])
+        return None if theta is None else holds(self.sets.feasible_set, i, theta)

@@ -20,6 +20,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchfsid.commands.figures import draw_observation
+from torchfsid.commands.map_panel import Marks
 from torchfsid.commands.observe import Observation, Verdict
 from torchfsid.commands.results_folder import OBSERVE, ResultsFolder, write_json, write_whole
 from torchfsid.config.documents import dump
@@ -139,7 +140,9 @@ class Observed:
             FigureError: it cannot be drawn.
             OSError: the file cannot be written.
         """
-        drawn = draw_observation(self._out, self.log.x, self.log.seen, self.log.bodies)
+        drawn = draw_observation(
+            self._out, self.log.x, self.log.seen, self.log.bodies, Marks.of(self.observation.config)
+        )
         of_suffix = {figure.suffix: figure for figure in drawn}
         if path is None:
             return of_suffix[".png"]

@@ -9,17 +9,23 @@ from pathlib import Path
 
 from rich.markup import escape
 
-from torchfsid.commands import report
 from torchfsid.commands.check import check
 from torchfsid.commands.command_line import use_one_thread
 from torchfsid.commands.declared_log import AUTO_FACTOR, DeclaredLog
 from torchfsid.commands.figures import draw_observation
 from torchfsid.commands.hypotheses import Hypotheses
+from torchfsid.commands.map_panel import Marks
 from torchfsid.commands.observe import Observation, times_in
 from torchfsid.commands.page.report import write_pages
 from torchfsid.commands.page.write import PAGE
+from torchfsid.commands.provenance import made_from
+from torchfsid.commands.report import print_reading, print_replaced, print_verdicts
+from torchfsid.commands.report_check import print_check, print_scan
+from torchfsid.commands.report_hypotheses import print_hypotheses
 from torchfsid.commands.results_folder import ResultsFolder, write_json, write_whole
 from torchfsid.commands.safety_figure import draw_safety
+from torchfsid.commands.scan import Range, scan
+from torchfsid.commands.scan_figure import draw_scan
 from torchfsid.commands.terminal import console, status, track
 from torchfsid.config.documents import dump
 from torchfsid.config.models import dump_models
@@ -36,6 +42,7 @@ UNKNOWN_FILES = ("safety.png", "safety.pdf", "unknown_numbers.json", "task_gain.
 """What it leaves besides, where safety parameters or other numbers of the model are unknown."""
 
 CHECKED = "check.json"
+SCANNED = ("scan.csv", "scan.json", "scan.png", "scan.pdf")
 
 
 def observe_log(
@@ -72,10 +79,12 @@ def observe_log(
     bound_file = f"{first.noise.quantity}_bound.json"
     also = [bound_file, *(["hypotheses.json", *([PAGE] if with_page else [])] if isinstance(run, Hypotheses) else [])]
     folder.claim([*files, *also], dump_models({name: of.stated for name, of in of_each.items()}))
+    print_replaced(folder, console())
     if run.smallest_bounds is not None:
         found = {"smallest": run.smallest_bounds, "factor": AUTO_FACTOR, "used": run.bound_used}
         found |= run.bound.to_json()
         write_json(folder.path / bound_file, found)
+    source = made_from(path)
     problems: list[OSError | FigureError] = []
     for name, observation in of_each.items():
         out = folder.path / name
@@ -89,10 +98,10 @@ def observe_log(
                     write_json(out / "task_gain.json", observation.narrowing.numbers["task.gain"].to_json())
             what, total = f"Observing {name}".strip(), observation.samples
             shown = partial(track, what=what, total=total, size=times_in)
-            observation.run(out, shown, mcap, path if merge else None)
+            observation.run(out, shown, source, mcap, path if merge else None)
             with status("Drawing"):
                 seen = observation.log
-                draw_observation(out, seen.x, seen.seen, seen.bodies)
+                draw_observation(out, seen.x, seen.seen, seen.bodies, Marks.of(observation.config))
                 if observation.config.is_unknown:
                     draw_safety(out)
         except (OSError, FigureError) as problem:
@@ -104,15 +113,35 @@ def observe_log(
             write_pages(folder.path)
     except (OSError, FigureError) as problem:
         problems.append(problem)
-    report.print_reading(log.reading, console())
+    print_reading(log.reading, console())
     if isinstance(run, Hypotheses):
-        report.print_hypotheses(run, folder.path, console())
+        print_hypotheses(run, folder.path, console())
     else:
-        report.print_verdicts(run, folder.path, console())
+        if run.smallest_bounds is not None:
+            with status("Trying other values", computes=True):
+                _ = run.alternative
+        print_verdicts(run, folder.path, console())
     if mcap is not None and mcap.exists():
         console().print(escape(f"ROS messages: {mcap}"))
     if problems:
         raise problems[0]
+
+
+def scan_log(path: Path, models: Mapping[str, ObserveConfig], folder: ResultsFolder | None, values: Range) -> None:
+    """`torchfsid check --scan`: the smallest bounds over the values of one key."""
+    use_one_thread()
+    if len(models) > 1:
+        raise ConfigError(f"--scan: expected one model, the configuration has {len(models)}: {', '.join(models)}")
+    (config,) = models.values()
+    log = _read(path, models)
+    found = scan(log, config, values, lambda wanted: track(wanted, f"Scanning {values.key}", len(wanted)))
+    if folder is not None:
+        folder.claim(SCANNED)
+        print_replaced(folder, console())
+        found.write(folder.path)
+        with status("Drawing"):
+            draw_scan(folder.path, found)
+    print_scan(found, console())
 
 
 def check_log(path: Path, models: Mapping[str, ObserveConfig], folder: ResultsFolder | None) -> None:
@@ -128,9 +157,9 @@ def check_log(path: Path, models: Mapping[str, ObserveConfig], folder: ResultsFo
             (folder.path / name).mkdir(exist_ok=True)
             write_json(folder.path / name / CHECKED, of_model.to_json())
     shown = console()
-    report.print_reading(log.reading, shown)
+    print_reading(log.reading, shown)
     for name, of_model in found.items():
-        report.print_check(of_model, name, shown)
+        print_check(of_model, name, shown)
 
 
 def _require_viewable(mcap: Path, models: Mapping[str, ObserveConfig], merge: bool) -> None:

@@ -5,55 +5,49 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Literal
 
 from rich.console import Console
 from rich.markup import escape
+from rich.table import Table
 
-from torchfsid.commands.check import Check
-from torchfsid.commands.hypotheses import Hypotheses, HypothesisVerdict
+from torchfsid.commands.fitted_table import Column, fitted_table
 from torchfsid.commands.judged_bound import JudgedBound
 from torchfsid.commands.observe import Observation, Verdict
-from torchfsid.commands.results import STATUS_NAMES, constraint_name, seconds
+from torchfsid.commands.results import STATUS_NAMES
+from torchfsid.commands.results_folder import ResultsFolder
 from torchfsid.commands.terminal import digits, ends, table
+from torchfsid.commands.where_to_look import constraint_name
 from torchfsid.logs.reading import Reading
 from torchfsid.observers.safety import SafetyObserver
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.outcome import Status
 
+MUCH = 0.1
+"""Share of the typical control from which on a bound that `auto` found may hide an error of the model."""
+
 MOST_EVENTS = 8
 """Contradictions that are printed."""
 
-MOST_COLUMNS = 4
-"""Models beyond which the table of hypotheses has a line, not a column, for each."""
+HEADINGS = (
+    "robot", "cases", "skipped", "volume", "diameter", "centroid", "centre", "radius", "shrank last", "truth", "status"
+)  # fmt: skip
+DROPPED = ("cases", "centre", "skipped", "radius", "shrank last", "volume", "centroid", "diameter")
+"""Columns that are left out in a narrow terminal, in this order."""
+
+WRITTEN = (
+    "estimates.csv", "sets.csv", "motion.csv", "regions.json", "config.yaml", "regions.png", "regions.pdf",
+    "safety.png", "safety.pdf",
+)  # fmt: skip
+"""Files that are named where they are there."""
 
 
 def print_verdicts(observation: Observation, out: Path, console: Console) -> None:
     """Print the final set of each robot."""
-    numbers = ("skipped", "volume", "diameter", "centroid", "centre", "radius", "shrank last")
-    verdicts = table(
-        f"{len(observation.log.t)} samples, set: {observation.config.set}", ["robot", "cases"], [*numbers, "status"]
-    )
-    verdicts.columns[-1].justify = "left"
-    found = observation.verdicts()
-    for verdict in found:
-        since = verdict.no_information_since
-        shown = observation.bound.cell(verdict.status, observation.smallest_bounds is not None)
-        is_doubtful = verdict.status != "ok" or observation.bound.is_useless
-        resets = "".join(f", reset at {seconds(t)}" for t in verdict.resets)
-        aside = f", {verdict.unexplained} set aside" if verdict.unexplained else ""
-        verdicts.add_row(
-            escape(verdict.robot),
-            " ".join(f"{case}:{count}" for case, count in verdict.cases.items() if count),
-            str(verdict.skipped),
-            _size(verdict.volume),
-            _size(verdict.diameter),
-            _point(verdict.centroid, verdict),
-            _point(verdict.centre, verdict),
-            _size(verdict.radius),
-            "never" if since is None else seconds(since),
-            (_red(shown) if is_doubtful else shown) + resets + aside,
-        )
-    console.print(verdicts)
+    found, bound = observation.verdicts(), observation.bound
+    console.print(_table(observation, found, console))
+    _print_trust(found, bound, console)
+    print_lines(observation.declared.clock.sentence(), console)
     if infeasible := [f"{verdict.robot} {verdict.infeasible}" for verdict in found if verdict.infeasible]:
         console.print(
             f"Rows may have been infeasible, and the controller took the least violation (of {len(observation.log.t)} "
@@ -65,8 +59,8 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
             "The velocity it arrived with counts as uncertain."
         )
     if observation.declared.recovery is not None:
-        _print_lines([observation.declared.recovery.sentence()], console)
-    _print_events(observation, console)
+        print_lines([observation.declared.recovery.sentence()], console)
+    _print_events(observation, found, console)
     if isinstance(observation.sets, SetMembershipObserver) and observation.sets.windows_used:
         shares = ", ".join(f"{length:g} s {share:.0%}" for length, share in observation.sets.windows_used.items())
         console.print(f"Windows over positions that were used: {shares}")
@@ -76,59 +70,119 @@ def print_verdicts(observation: Observation, out: Path, console: Console) -> Non
                 "velocities if you can."
             )
     if observation.narrowing is not None:
-        _print_lines(observation.narrowing.said(), console)
+        print_lines(observation.narrowing.said(), console)
     if observation.config.outliers:
-        _print_outliers(observation, console)
+        print_outliers(observation, console)
     if isinstance(observation.sets, SafetyObserver):
-        _print_safety(observation.sets, observation.robots, observation.declared.row_labels, console)
+        _print_safety(observation, observation.sets, console)
     noise = observation.config.noise
-    _print_bound(console, observation.smallest_bounds, observation.bound, noise.quantity)
+    alternative = observation.alternative
+    print_bound(console, observation.smallest_bounds, bound, noise.quantity, is_explained=alternative is not None)
     if strained := observation.strained():
         console.print(
             f"More than half of noise.{noise.quantity}, {observation.bound_used:g} {noise.unit}, is needed by "
             f"{escape(', '.join(strained))}: if the errors are not that large, the model is wrong (torchfsid check)"
         )
-    files = ("estimates.csv", "regions.json", "config.yaml", "regions.png", "regions.pdf", "safety.png", "safety.pdf")
-    there = ", ".join(file for file in files if (out / file).is_file())
+    if alternative is not None:
+        console.print(f"{red('Warning:')} {escape(alternative.sentence(noise.unit))}", soft_wrap=True)
+    if large := observation.hardly_cut():
+        console.print(
+            escape(f"The log says little of {', '.join(large)}: the set is still more than half of the prior."),
+            soft_wrap=True,
+        )
+    there = ", ".join(file for file in WRITTEN if (out / file).is_file())
     console.print(escape(f"Results: {out}/{there}"))
 
 
-def _print_events(observation: Observation, console: Console) -> None:
-    """Print when and by which rows the robots were first contradicted."""
-    events, labels = observation.sets.events, observation.declared.row_labels
+def _table(observation: Observation, found: Sequence[Verdict], console: Console) -> Table:
+    """A line per robot."""
+    unit, p, clock = observation.config.task.unit, observation.sets.prior.dim, observation.declared.clock
+    rows = []
+    for verdict in found:
+        since = verdict.no_information_since
+        shown = observation.bound.cell(verdict.status, observation.smallest_bounds is not None)
+        is_doubtful = verdict.status != "ok" or observation.bound.is_useless
+        resets = "".join(f", reset at {clock(t)}" for t in verdict.resets)
+        aside = f", {verdict.unexplained} set aside" if verdict.unexplained else ""
+        rows.append(
+            [
+                escape(verdict.robot),
+                " ".join(f"{case}:{count}" for case, count in verdict.cases.items() if count),
+                str(verdict.skipped),
+                *_sizes(verdict),
+                "never" if since is None else clock(since),
+                {None: "-", True: "inside", False: red("outside")}[verdict.holds_truth],
+                (red(shown) if is_doubtful else shown) + resets + aside,
+            ]
+        )
+    kinds: dict[str, Literal["name", "words"]] = {
+        "robot": "name",
+        "cases": "words",
+        "truth": "words",
+        "status": "words",
+    }
+    columns = [
+        Column(heading, kinds.get(heading, "number"), list(cells))
+        for heading, cells in zip(HEADINGS, zip(*rows, strict=True), strict=True)
+        if heading != "truth" or observation.config.truth
+    ]
+    units = f", lengths in {unit}, volume in {unit}{'' if p == 1 else f'^{p}'}" if unit == "m" else ""
+    title = f"{len(observation.log.t)} samples, set: {observation.config.set}{units}"
+    return fitted_table(title, columns, DROPPED, console, "see regions.json, or widen the terminal")
+
+
+def _sizes(verdict: Verdict) -> list[str]:
+    """What the table says of a set. A set that is not to be trusted has no size."""
+    if verdict.status != "ok":
+        return ["-"] * 5
+    centroid, centre = _point(verdict.centroid, verdict), _point(verdict.centre, verdict)
+    return [size(verdict.volume), size(verdict.diameter), centroid, centre, size(verdict.radius)]
+
+
+def _print_trust(found: Sequence[Verdict], bound: JudgedBound, console: Console) -> None:
+    """Print what the statuses mean."""
+    if bad := [f"{verdict.robot} ({verdict.status})" for verdict in found if verdict.status != "ok"]:
+        said = f"Not to be trusted: {', '.join(bad)}. The model, the prior or a bound is wrong."
+        console.print(red(escape(said)), soft_wrap=True)
+    if not bound.is_useless and any(verdict.status == "ok" for verdict in found):
+        console.print("ok: no contradiction was seen. That is no proof of the model.")
+
+
+def _print_events(observation: Observation, found: Sequence[Verdict], console: Console) -> None:
+    """Print when and by which constraints robots were first contradicted, and the keys to look at."""
+    events, labels, clock = observation.sets.events, observation.declared.row_labels, observation.declared.clock
+    to_look: dict[str, list[str]] = {}
     for event in events[:MOST_EVENTS]:
+        robot, status = observation.robots[event.robot], STATUS_NAMES[event.status]
         rows = dict.fromkeys(
-            constraint_name(source, labels) + ("" if math.isnan(time) or time == event.t else f" at {seconds(time)}")
+            constraint_name(source, labels) + ("" if math.isnan(time) or time == event.t else f" at {clock(time)}")
             for time, source in event.rows
         )
         what = "is violated" if event.status == Status.ALARM else "contradict each other"
-        named = ", ".join(rows) or "the prior"
-        console.print(
-            escape(
-                f"{observation.robots[event.robot]} at {seconds(event.t)}: {STATUS_NAMES[event.status]}: {named} {what}"
-            ),
-            soft_wrap=True,
-        )
+        print_lines([f"{robot} at {clock(event.t)}: {status}: {', '.join(rows) or 'the prior'} {what}"], console)
+        keys = observation.declared.where_to_look(constraint_name(source, labels) for _, source in event.rows)
+        to_look.setdefault(keys, []).append(robot)
     if len(events) > MOST_EVENTS:
         console.print(f"... and {len(events) - MOST_EVENTS} more, see regions.json")
-    if any(verdict.status != "ok" for verdict in observation.verdicts()):
-        console.print("torchfsid check says which rows and which bounds do not fit.")
+    print_lines([f"{', '.join(dict.fromkeys(robots))}: {keys}" for keys, robots in to_look.items()], console)
+    if any(verdict.status != "ok" for verdict in found):
+        console.print("torchfsid check says which keys and which bounds do not fit.")
 
 
-def _print_lines(lines: Sequence[str], console: Console) -> None:
+def print_lines(lines: Sequence[str], console: Console) -> None:
     for line in lines:
         console.print(escape(line), soft_wrap=True)
 
 
-def _print_outliers(observation: Observation, console: Console) -> None:
+def print_outliers(observation: Observation, console: Console) -> None:
     """Print what the sets promise, and the samples that are set aside."""
-    q, labels = observation.config.outliers, observation.declared.row_labels
+    q, labels, clock = observation.config.outliers, observation.declared.row_labels, observation.declared.clock
     samples = "sample is an outlier" if q == 1 else "samples are outliers"
     console.print(f"outliers: {q}: a set holds the truth if at most {q} of its robot's {samples}")
     for verdict in observation.verdicts():
         for certain in (True, False):
             if named := [
-                f"{seconds(sample.t)} ({', '.join(dict.fromkeys(constraint_name(s, labels) for s in sample.sources))})"
+                f"{clock(sample.t)} ({', '.join(dict.fromkeys(constraint_name(s, labels) for s in sample.sources))})"
                 for sample in verdict.set_aside
                 if sample.is_certain == certain
             ]:
@@ -136,8 +190,9 @@ def _print_outliers(observation: Observation, console: Console) -> None:
                 console.print(escape(f"{verdict.robot}: {what}: {', '.join(named)}"), soft_wrap=True)
 
 
-def _print_safety(observer: SafetyObserver, robots: Sequence[str], labels: Sequence[str], console: Console) -> None:
+def _print_safety(observation: Observation, observer: SafetyObserver, console: Console) -> None:
     """Print what was learned about the safety parameters, of the team or of each robot."""
+    robots, labels, clock = observation.robots, observation.declared.row_labels, observation.declared.clock
     unknown = observer.model.unknown
     what = "safety distance" if unknown.margin is None else "margin"
     shown = table("safety parameters", ["of"], ["gain", f"{what} [m]"])
@@ -149,9 +204,7 @@ def _print_safety(observer: SafetyObserver, robots: Sequence[str], labels: Seque
     if not bool(of_gain.all() & of_distance.all()):
         console.print("* not bounded by the data: this end holds only because of the declared interval")
     for refutation in observer.refutations:
-        rows = dict.fromkeys(
-            f"{robots[robot]} {labels[row]} at {seconds(time)}" for time, robot, row in refutation.rows
-        )
+        rows = dict.fromkeys(f"{robots[robot]} {labels[row]} at {clock(time)}" for time, robot, row in refutation.rows)
         whose = (
             "the team has no safety parameters in common"
             if refutation.robot is None
@@ -161,7 +214,7 @@ def _print_safety(observer: SafetyObserver, robots: Sequence[str], labels: Seque
         if refutation.unexplained:
             whom = ", ".join(robots[robot] for robot in refutation.unexplained)
             reasons.append(f"no theta in the prior explains the motion of {whom} with those that are left")
-        console.print(escape("; ".join([f"{whose}, found at {seconds(refutation.t)}", *reasons])), soft_wrap=True)
+        console.print(escape("; ".join([f"{whose}, found at {clock(refutation.t)}", *reasons])), soft_wrap=True)
     if bool((observer.status >= Status.INCONSISTENT).all()):
         console.print(
             "no robot is explained by any safety parameters: something else in the model or the prior is wrong"
@@ -171,127 +224,57 @@ def _print_safety(observer: SafetyObserver, robots: Sequence[str], labels: Seque
         console.print(escape(f"without {names} the others can have the same parameters"))
 
 
+def print_replaced(folder: ResultsFolder, console: Console) -> None:
+    """Print that an earlier run is gone."""
+    if folder.replaced:
+        what = f"the {len(folder.replaced)} files of an earlier run"
+        console.print(escape(f"{folder.path}: replaces {what}"), soft_wrap=True)
+
+
 def print_reading(reading: Reading, console: Console) -> None:
     """Print what was found while the log was read."""
     for sentence in reading.sentences():
         console.print(escape(sentence), soft_wrap=True)
 
 
-def print_hypotheses(hypotheses: Hypotheses, out: Path, console: Console) -> None:
-    """Print which hypotheses are left for each robot, and what refuted the others."""
-    names, found = list(hypotheses.observations), hypotheses.verdicts()
-    cells = {robot: [_cell(of_robot.get(name)) for name in names] for robot, of_robot in found.items()}
-    left = [
-        ", ".join(name for name in names if name in of_robot and not of_robot[name].is_refuted) or _red("none")
-        for of_robot in found.values()
-    ]
-    if len(names) <= MOST_COLUMNS:
-        verdicts = table("which model is it?", ["robot"], [*names, "left"])
-        for robot, of_robot, names_left in zip(found, cells.values(), left, strict=True):
-            verdicts.add_row(escape(robot), *of_robot, names_left)
-    else:
-        verdicts = table("which model is it?", ["model"], list(found))
-        for name, of_model in zip(names, zip(*cells.values(), strict=True), strict=True):
-            verdicts.add_row(escape(name), *of_model)
-        verdicts.add_section()
-        verdicts.add_row("left", *left)
-    for column in verdicts.columns[1:]:
-        column.justify = "left"
-    console.print(verdicts)
-    for name, observation in hypotheses.observations.items():
-        if observation.narrowing is not None:
-            _print_lines([f"{name}: {line}" for line in observation.narrowing.said()], console)
-        if observation.config.outliers:
-            console.print(f"[bold]{escape(name)}[/]: ", end="")
-            _print_outliers(observation, console)
-        sets = observation.sets
-        explains_some = bool((sets.status < Status.INCONSISTENT).any())
-        if isinstance(sets, SafetyObserver) and sets.team_is_refuted and explains_some:
-            console.print(escape(f"{name}: the robots have no safety parameters in common, each has its own"))
-    first = next(iter(hypotheses.observations.values()))
-    if first.declared.recovery is not None:
-        _print_lines([first.declared.recovery.sentence()], console)
-    quantity = first.config.noise.quantity
-    _print_bound(console, hypotheses.smallest_bounds, hypotheses.bound, quantity)
-    console.print(escape(f"Results: {out}/hypotheses.json, and a folder for each of {', '.join(names)}"))
-
-
-def _cell(verdict: HypothesisVerdict | None) -> str:
-    """What the log says about one model for one robot."""
-    if verdict is None:
-        return "-"
-    if verdict.refuted_at is not None:
-        return f"refuted at {seconds(verdict.refuted_at)} by {' / '.join(_rows(verdict))}"
-    if verdict.is_refuted:
-        return "refuted: no values of its unknown numbers explain it"
-    alarm = "" if verdict.status == "ok" else f", {_red(verdict.status)}"
-    bound = " (bound useless)" if verdict.bound_useless else ""
-    return f"possible{bound}, volume {_size(verdict.volume)}{alarm}"
-
-
-def print_check(found: Check, name: str, console: Console) -> None:
-    """Print the smallest bounds, what contradicts the declared bounds, and the conclusions.
+def print_bound(
+    console: Console,
+    smallest: Mapping[str, float] | None,
+    bound: JudgedBound,
+    quantity: str,
+    is_explained: bool = False,
+) -> None:
+    """Print the bound that `auto` found, and a warning if the bound is useless, found or declared.
 
     Args:
-        found: the result of `check`.
-        name: name of the hypothesis, or "".
         console: where to print.
+        smallest: with `auto`, each robot's smallest bound.
+        bound: the bound in use.
+        quantity: what it bounds.
+        is_explained: a key is named that may have made it so large.
     """
-    robots = table(
-        f"smallest {found.quantity} bound and residuals [{found.unit}]",
-        ["robot"],
-        ["bound", "median", "p95", "max", "at", "samples"],
-    )
-    faults = table(
-        f"at odds with the declared bounds, {found.quantity} {found.declared:.3g} {found.unit}",
-        ["robot", "what", "row"],
-        ["samples", "first", f"worst [{found.unit}]"],
-    )
-    for robot in found.robots:
-        sizes = [_size(size) for size in (robot.smallest_bound, robot.median, robot.p95, robot.worst)]
-        robots.add_row(
-            escape(robot.robot),
-            *sizes,
-            "-" if math.isnan(robot.worst_time) else seconds(robot.worst_time),
-            str(robot.samples),
-        )
-        for what, listed in (("unexplained", robot.contradictions), ("violated", robot.violations)):
-            for fault in listed:
-                row = escape(f"{fault.row} (soft)" if fault.soft else fault.row)
-                size = [str(fault.samples), seconds(fault.first), f"{fault.worst:.3g}"]
-                faults.add_row(escape(robot.robot), what, row, *size)
-    if name:
-        console.print(f"[bold]{name}[/]")
-    console.print(robots)
-    if faults.row_count:
-        console.print(faults)
-    for conclusion in found.conclusions():
-        console.print(f"- {escape(conclusion)}", soft_wrap=True)
-
-
-def _print_bound(console: Console, smallest: Mapping[str, float] | None, bound: JudgedBound, quantity: str) -> None:
-    """Print the bound that `auto` found, and a warning if the bound is useless, found or declared."""
     if smallest is not None:
         robot = max(smallest, key=lambda robot: smallest[robot])
         found = f"noise.{quantity}: auto found {smallest[robot]:.3g} {bound.unit} (robot {robot})"
         takes = f"takes {bound.bound:.3g} {bound.unit}"
         console.print(escape(f"{found}, {takes}: {bound.compared()}"), soft_wrap=True)
+        if not bound.is_useless and (large := [name for name, of in smallest.items() if of > MUCH * bound.typical]):
+            said = (
+                f"More than {MUCH:.0%} of the typical control is needed by {', '.join(large)}: if the errors are not "
+                "that large, the model is wrong (torchfsid check)"
+            )
+            console.print(escape(said), soft_wrap=True)
     if bound.is_useless:
-        more = "" if smallest is None else " (torchfsid check names rows and looks for shifts)"
-        warning = escape(bound.warning(is_needed=smallest is not None) + more)
-        console.print(f"{_red('Warning:')} {warning}", soft_wrap=True)
+        more = "" if smallest is None or is_explained else " (torchfsid check names rows and looks for shifts)"
+        warning = escape(bound.warning(smallest is not None, is_explained) + more)
+        console.print(f"{red('Warning:')} {warning}", soft_wrap=True)
 
 
-def _rows(verdict: HypothesisVerdict) -> list[str]:
-    """The labels of the rows in the evidence, each once."""
-    return [escape(row) for row in dict.fromkeys(row for _, row in verdict.evidence)]
-
-
-def _red(text: str) -> str:
+def red(text: str) -> str:
     return f"[bold red]{text}[/]"
 
 
-def _size(value: float) -> str:
+def size(value: float) -> str:
     """The size as text. A dash if it is NaN, as that of an empty set."""
     return "-" if math.isnan(value) else f"{value:.3g}"
 

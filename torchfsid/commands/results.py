@@ -5,11 +5,22 @@
     regions.json    the final set of every robot, rows A theta <= b
     sets.csv        the sets over time (`history`)
 
-Columns of estimates.csv: t, robot, case, n_active, then the set's volume, diameter, centre_i (Chebyshev), radius and
-centroid_i, then ukf_i, hybrid_i, status. Further sets follow with their name as prefix. `case` and `n_active` are empty
-where the robot was not measured. ukf_i and hybrid_i are empty without a filter. Sizes and centres of an empty set are
-empty. With unknown safety parameters gain_low, gain_high, distance_low, distance_high come before the status; the
-distance is the declared safety distance or margin.
+Columns of estimates.csv, where i counts the entries of theta (0 and 1 are x and y of a goal), and m stands for the unit
+of theta:
+
+    t                 time of the sample, as logged [s]
+    robot             its name
+    case, n_active    case A to E and number of the active rows; empty where the robot was not measured
+    volume            of the set [m^p]: in the plane its area [m^2]
+    diameter          of the set [m]
+    centre_i, radius  Chebyshev centre and radius: the largest ball in the set [m]
+    centroid_i        of the set [m]: the estimate to use if there has to be one point
+    ukf_i, hybrid_i   the filter's estimate, and the same moved into the set [m]; empty without a filter
+    gain_low, ..      with unknown safety parameters: gain_low, gain_high [1/s for power 1 and squared distances],
+                      distance_low, distance_high, of the declared safety distance or margin [m]
+    status            ok (no contradiction seen, no proof of the model), alarm or inconsistent (not to be trusted)
+
+Further sets follow with their name as prefix. Sizes and centres of an empty set are empty.
 """
 
 from __future__ import annotations
@@ -30,6 +41,7 @@ from torchfsid.commands.interruption import uninterrupted
 from torchfsid.commands.results_folder import write_json
 from torchfsid.commands.safety_results import COLUMNS, Distances, SafetyColumns, refutation, safety, without_repeats
 from torchfsid.commands.table_file import TableFile, line_of, lines_of, number
+from torchfsid.commands.where_to_look import constraint_name
 from torchfsid.halfspaces import array
 from torchfsid.identification.kkt import CASES
 from torchfsid.observers.hybrid import HybridEstimate, HybridEstimates
@@ -61,6 +73,8 @@ class ResultsWriter:
         labels: labels of the rows of the model.
         bound: what regions.json says of the velocity bound.
         log: what it says of the log.
+        truth: the true theta of some robots.
+        made_from: the log and the version, see `provenance`.
     """
 
     def __init__(
@@ -72,11 +86,14 @@ class ResultsWriter:
         labels: Sequence[str] = (),
         bound: Mapping[str, object] = MappingProxyType({}),
         log: Mapping[str, object] = MappingProxyType({}),
+        truth: Mapping[str, Sequence[float]] = MappingProxyType({}),
+        made_from: Mapping[str, object] = MappingProxyType({}),
     ):
         self.out, self.robots, self.observer, self.others = out, list(robots), observer, others
-        self._labels, self._seen = labels, Distances()
+        self._labels, self._seen, self._truth = labels, Distances(), truth
         self._names = [line_of([robot]) for robot in self.robots]
-        self._told = {name: dict(content) for name, content in (("bound", bound), ("log", log)) if content}
+        told = (("bound", bound), ("log", log), ("made_from", made_from))
+        self._told = {name: dict(content) for name, content in told if content}
         self._safety = SafetyColumns(observer) if isinstance(observer, SafetyObserver) else None
         self._described = {name: _Descriptions() for name in ("", *others)}
 
@@ -113,7 +130,7 @@ class ResultsWriter:
             raise problems[0]
 
     def _write_regions(self) -> None:
-        found = regions(self.robots, self.observer, self._seen, self._labels)
+        found = regions(self.robots, self.observer, self._seen, self._labels, self._truth)
         write_json(self.out / "regions.json", found | self._told)
 
     def write(
@@ -166,6 +183,11 @@ def of_sets(estimate: Estimate) -> SetEstimates:
     return found if isinstance(found, SetEstimates) else SetEstimates.of(found)
 
 
+def holds(sets: FeasibleSet, i: int, theta: Sequence[float]) -> bool:
+    """Is theta in the set of robot i?"""
+    return bool(sets.select(torch.tensor([i])).contains(torch.tensor([theta], dtype=torch.float64)))
+
+
 def set_columns(p: int) -> list[str]:
     """Names of the columns that `describe` fills."""
     return ["volume", "diameter", *_indexed("centre", p), "radius", *_indexed("centroid", p)]
@@ -213,31 +235,20 @@ def _changes(which: Int[Tensor, "S B"]) -> list[int]:
     return (1 + (which[1:] != which[:-1]).any(-1).nonzero().flatten()).tolist()
 
 
-def seconds(t: float) -> str:
-    """A time [s] as text, rounded to 0.1 ms. This holds for times since 1970, too."""
-    return f"{round(t, 4):.15g} s"
-
-
-def constraint_name(source: int, labels: Sequence[str]) -> str:
-    """The name of the constraint behind a `source` of `critical_region` or `inverse_optimal_set`.
-
-    Args:
-        source: the index.
-        labels: labels of the rows of the model.
-    """
-    if source < 0:
-        return "prior"
-    return labels[source % len(labels)] if source < 2 * len(labels) else "nominal control"
-
-
 def regions(
-    robots: Sequence[str], observer: SetObserver, seen: Distances | None = None, labels: Sequence[str] = ()
+    robots: Sequence[str],
+    observer: SetObserver,
+    seen: Distances | None = None,
+    labels: Sequence[str] = (),
+    truth: Mapping[str, Sequence[float]] = MappingProxyType({}),
 ) -> dict:
     """The content of regions.json: the final sets. NaN is null there.
 
     `last_cut` is NaN if the set never shrank. Sizes and centres are NaN if the set is empty. `facets` says at which
     time and from which constraint each row came (`source` as in `critical_region` and `inverse_optimal_set`, -1 for the
-    prior). With `outliers` q > 0 every robot has an entry of that name: q, how many samples are left unexplained at
+    prior; `constraint` is its name). The rows of `events` are named alike, and `prior` says whether sides of the prior
+    are among them: it may be too small. Where a robot's `truth` is given, it is repeated, and whether it is inside.
+    With `outliers` q > 0 every robot has an entry of that name: q, how many samples are left unexplained at
     least, and which (`SetAside`).
     """
     sets = observer.feasible_set
@@ -262,7 +273,7 @@ def regions(
             "skipped": int(observer.skipped[i]),
             "infeasible": int(observer.infeasible[i]),
             "facets": [
-                {"time": time, "source": source}
+                {"time": time, "source": source, "constraint": constraint_name(source, labels)}
                 for time, source in zip(facets.time[i][real].tolist(), facets.source[i][real].tolist(), strict=True)
             ],
             "events": [
@@ -270,16 +281,23 @@ def regions(
                     "t": float(event.t),
                     "status": STATUS_NAMES[event.status],
                     "reset": event.reset,
-                    "rows": [{"time": float(time), "source": source} for time, source in event.rows],
+                    "prior": any(source < 0 for _, source in event.rows),
+                    "rows": [
+                        {"time": float(time), "source": source, "constraint": constraint_name(source, labels)}
+                        for time, source in event.rows
+                    ],
                 }
                 for event in events
             ],
         }
+    for robot, theta in truth.items():
+        of_robots[robot]["truth"] = {"theta": list(theta), "inside": holds(sets, robots.index(robot), theta)}
     if isinstance(observer, SetMembershipObserver) and observer.outliers:
         for robot, unexplained in zip(robots, observer.unexplained.tolist(), strict=True):
             of_robots[robot]["outliers"] = {"q": observer.outliers, "at_least": unexplained, "set_aside": []}
         for found in observer.set_aside():
-            entry = {"t": found.t, "sources": found.sources, "certain": found.is_certain}
+            names = [constraint_name(source, labels) for source in found.sources]
+            entry = {"t": found.t, "sources": found.sources, "constraints": names, "certain": found.is_certain}
             of_robots[robots[found.robot]]["outliers"]["set_aside"].append(entry)
     if not isinstance(observer, SafetyObserver):
         used = {f"{length:g}": share for length, share in observer.windows_used.items()}

@@ -38,10 +38,12 @@ class ResultsFolder:
 
     Attributes:
         claimed: this command owns the folder now.
+        replaced: names of the files of an earlier run that `claim` removed.
     """
 
     def __init__(self, path: Path, kind: str | None):
         self.path, self.kind = path, kind
+        self.replaced: tuple[str, ...] = ()
         self._lock: BinaryIO | None = None
 
     @property
@@ -102,6 +104,7 @@ class ResultsFolder:
         if not resume:
             # A command that adds to a folder replaces its own files only.
             mine = names if self.kind is None else [*listed, *names]
+            self.replaced = tuple(name for name in dict.fromkeys(mine) if (self.path / name).is_file())
             for name in dict.fromkeys(mine):
                 self._remove(name)
             listed = [name for name in listed if name not in mine]

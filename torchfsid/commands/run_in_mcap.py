@@ -25,7 +25,7 @@ import numpy as np
 import torch
 
 from torchfsid.commands.declared_log import DeclaredLog
-from torchfsid.commands.figures import ROBOT_COLOURS
+from torchfsid.commands.figure_style import ROBOT_COLOURS
 from torchfsid.commands.interruption import uninterrupted
 from torchfsid.commands.results import STATUS_NAMES
 from torchfsid.commands.safety_results import without_repeats

@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from torchfsid.commands.figures import MOST_NAMED, colour, plain_name, render, thinned
+from torchfsid.commands.figure_style import MOST_NAMED, colour, plain_name, render, thinned
 from torchfsid.errors import FigureError, one_line
 
 TEAM = "0.25"

@@ -34,7 +34,12 @@ if TYPE_CHECKING:
 
 
 class UnknownClassKConfig(Strict):
-    """`ClassKConfig` whose gain may be unknown within [low, high]."""
+    """`ClassKConfig` whose gain may be unknown within [low, high].
+
+    Attributes:
+        gain: gain of alpha, a number or bounds [low, high]. Its unit makes alpha(h) a rate of h: [1/s] with power 1.
+        power: exponent of alpha.
+    """
 
     gain: PositiveOrInterval
     power: Positive = 1.0
@@ -46,7 +51,12 @@ class UnknownClassKConfig(Strict):
 
 
 class ClassKConfig(Strict):
-    """`ClassK`: alpha(h) = gain sign(h) |h|^power."""
+    """`ClassK`: alpha(h) = gain sign(h) |h|^power.
+
+    Attributes:
+        gain: gain of alpha. Its unit makes alpha(h) a rate of h: [1/s] with power 1.
+        power: exponent of alpha.
+    """
 
     gain: Positive
     power: Positive = 1.0
@@ -89,6 +99,11 @@ class _KeepsDistance(Strict):
     def uses_radius(self) -> bool:
         """Do the rows need the bodies' radii?"""
         return self.margin is not None
+
+    @property
+    def _distance(self) -> str:
+        """The key of the distance that is kept."""
+        return "safety_distance" if self.margin is None else "margin"
 
     def require_radii(self, radius: Sequence[float] | None) -> None:
         """Check that the log has the radii that the rows need [m].
@@ -150,6 +165,11 @@ class AvoidanceConfig(_KeepsDistance):
         if self.shared is not None and not self.is_unknown:
             raise wrong("expected an unknown gain or distance [low, high] to be shared", "shared")
         return self
+
+    @property
+    def suspects(self) -> tuple[str, ...]:
+        """The keys to look at where a row of the barrier contradicts a log."""
+        return ("class_k.gain", "class_k.power", self._distance, "neighbour_velocity")
 
     @property
     def is_unknown(self) -> bool:
@@ -224,6 +244,11 @@ class SecondOrderAvoidanceConfig(_KeepsDistance):
                 "bodies have no distances of their own where the safety distance is unknown", "safety_distances"
             )
         return self
+
+    @property
+    def suspects(self) -> tuple[str, ...]:
+        """The keys to look at where a row of the barrier contradicts a log."""
+        return ("class_k.0.gain", "class_k.1.gain", self._distance, "neighbour_acceleration")
 
     @property
     def uncertain(self) -> bool:

@@ -33,8 +33,13 @@ if TYPE_CHECKING:
 
 
 class _RobotsOwn(Strict):
-    """A barrier whose rows do not depend on other bodies."""
+    """A barrier whose rows do not depend on other bodies.
 
+    Attributes:
+        suspects: the keys to look at where a row of the barrier contradicts a log.
+    """
+
+    suspects: ClassVar[tuple[str, ...]] = ("limit",)
     is_unknown: ClassVar[bool] = False
     is_second_order: ClassVar[bool] = False
     uncertain: ClassVar[bool] = False
@@ -53,7 +58,12 @@ class _RobotsOwn(Strict):
 
 
 class SpeedBoxConfig(_RobotsOwn):
-    """`SpeedBox`: a limit per axis [m/s]."""
+    """`SpeedBox`: a limit per axis [m/s].
+
+    Attributes:
+        limit: the largest speed along each axis [m/s].
+        soft: the controller may violate the rows.
+    """
 
     kind: Literal["speed_box"] = "speed_box"
     limit: Annotated[tuple[Positive, ...], Field(min_length=2, max_length=2)]
@@ -67,7 +77,12 @@ class SpeedBoxConfig(_RobotsOwn):
 
 
 class AccelerationBoxConfig(_RobotsOwn):
-    """`SpeedBox` of robots that are driven by accelerations: a limit per axis [m/s2]."""
+    """`SpeedBox` of robots that are driven by accelerations: a limit per axis [m/s2].
+
+    Attributes:
+        limit: the largest acceleration along each axis [m/s2].
+        soft: the controller may violate the rows.
+    """
 
     kind: Literal["acceleration_box"] = "acceleration_box"
     limit: Annotated[tuple[Positive, ...], Field(min_length=2, max_length=2)]
@@ -82,7 +97,13 @@ class AccelerationBoxConfig(_RobotsOwn):
 
 
 class SpeedPolygonConfig(_RobotsOwn):
-    """`SpeedPolygon`: a regular polygon of circumradius `limit` [m/s]."""
+    """`SpeedPolygon`: a regular polygon of circumradius `limit` [m/s].
+
+    Attributes:
+        sides: number of sides. A side, not a corner, crosses the first axis.
+        limit: circumradius: the corners have this speed [m/s].
+        soft: the controller may violate the rows.
+    """
 
     kind: Literal["speed_polygon"] = "speed_polygon"
     sides: Annotated[int, Field(strict=True, ge=3, le=360)]
@@ -97,7 +118,15 @@ class SpeedPolygonConfig(_RobotsOwn):
 
 
 class ArenaConfig(_RobotsOwn):
-    """`Arena`: keep a distance `margin` [m] from the walls of a box [m]."""
+    """`Arena`: keep a distance `margin` [m] from the walls of a box [m].
+
+    Attributes:
+        lower: lower corner of the box [m].
+        upper: upper corner of the box [m].
+        margin: distance that is kept from the walls [m].
+        class_k: the function alpha of the barrier.
+        soft: the controller may violate the rows.
+    """
 
     kind: Literal["arena"] = "arena"
     lower: PlanarVector
@@ -105,6 +134,7 @@ class ArenaConfig(_RobotsOwn):
     margin: NonNegative = 0.0
     class_k: ClassKConfig
     soft: Flag = False
+    suspects: ClassVar[tuple[str, ...]] = ("class_k.gain", "margin", "lower", "upper")
 
     @model_validator(mode="after")
     def _is_a_box(self) -> ArenaConfig:
@@ -119,7 +149,12 @@ class ArenaConfig(_RobotsOwn):
 
 
 class SpeedDiscConfig(_RobotsOwn):
-    """`SpeedDisc`: |u| <= limit [m/s]."""
+    """`SpeedDisc`: |u| <= limit [m/s].
+
+    Attributes:
+        limit: the largest speed [m/s].
+        soft: the controller may violate the rows.
+    """
 
     kind: Literal["speed_disc"] = "speed_disc"
     limit: Positive
@@ -134,7 +169,12 @@ class SpeedDiscConfig(_RobotsOwn):
 
 
 class NeighboursConfig(Strict):
-    """Which bodies an ORCA controller avoids: the `count` nearest ones nearer than `distance` [m]."""
+    """Which bodies an ORCA controller avoids: the `count` nearest ones nearer than `distance` [m].
+
+    Attributes:
+        count: the largest number of bodies.
+        distance: distance beyond which bodies are not avoided [m].
+    """
 
     count: Annotated[int, Field(strict=True, ge=1)]
     distance: Positive
@@ -162,6 +202,7 @@ class OrcaConfig(Strict):
     is_unknown: ClassVar[bool] = False
     is_second_order: ClassVar[bool] = False
     uncertain: ClassVar[bool] = True
+    suspects: ClassVar[tuple[str, ...]] = ("time_horizon", "margin", "max_speed", "time_step")
     narrowed: ClassVar[Units] = {("time_horizon",): "s", ("margin",): "m"}
 
     @model_validator(mode="after")

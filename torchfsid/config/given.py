@@ -27,6 +27,12 @@ if TYPE_CHECKING:
 
 Handler = Callable[[Any], Any]
 
+UNITS = {"goal": "m", "centre": "m", "offset": "m", "velocity": "m/s"}
+"""Units of theta by the names of its entries, without the axis."""
+
+NO_PLACES = ("offset", "velocity")
+"""Names of what is no place."""
+
 GIVEN = "python"
 """The kind of a section that is an object."""
 
@@ -60,6 +66,19 @@ class GivenTask(_Given, _Task):
     @property
     def parameters(self) -> int:
         return len(self.object.parameter_names)
+
+    @property
+    def unit(self) -> str:
+        """The unit of theta, as far as the names of its entries tell it."""
+        return UNITS.get(self._what, "")
+
+    @property
+    def is_place(self) -> bool:
+        return self._what not in NO_PLACES
+
+    @property
+    def _what(self) -> str:
+        return self.object.parameter_names[0].rpartition("_")[0]
 
     @property
     def is_clipped(self) -> bool:

@@ -19,7 +19,7 @@ from torchfsid.config.documents import Strict, wrong
 from torchfsid.config.given import GIVEN, GivenBarrier, GivenTask, a_barrier, a_prior, a_task, bounds, is_object
 from torchfsid.config.motion_capture import LogConfig
 from torchfsid.config.observers import AccelerationNoiseConfig, ObservedNoiseConfig, PriorConfig, UkfConfig
-from torchfsid.config.quantities import BodyName, Positive, require_body
+from torchfsid.config.quantities import BodyName, Positive, Vector, require_body
 from torchfsid.config.tasks import TaskConfig
 from torchfsid.config.unknown_numbers import UnknownNumber, unknown_numbers
 from torchfsid.errors import ConfigError
@@ -85,6 +85,8 @@ class ObserveConfig(Strict):
         log: the form of a log of motion capture. Other logs have columns of their own.
         ukf: the unscented Kalman filter that runs beside the sets, or False for none. It is left out with the map
             `si_to_uni`, since positions then do not follow the commands.
+        truth: the true theta of some robots, where it is known. It marks figures, tables and regions.json, and is used
+            for nothing else: sets, bounds and statuses are the same without it.
     """
 
     task: Annotated[SerializeAsAny[TaskConfig], WrapValidator(a_task)]
@@ -105,6 +107,7 @@ class ObserveConfig(Strict):
     bag: BagConfig | None = None
     log: LogConfig | None = None
     ukf: OptionalUkfConfig = UkfConfig()
+    truth: dict[BodyName, Vector] | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -118,6 +121,9 @@ class ObserveConfig(Strict):
         expected, got = self.task.parameters, len(self.prior.lower)
         if got != expected:
             raise wrong(f"task '{self.task.kind}' has {expected} parameters, lower and upper have {got}", "prior")
+        for robot, theta in (self.truth or {}).items():
+            if len(theta) != expected:
+                raise wrong(f"task '{self.task.kind}' has {expected} parameters, got {len(theta)}", f"truth.{robot}")
         require_one_order(self.dynamics, self.task, self.barriers, self.noise)
         self._require_poses()
         unknown = [i for i, barrier in enumerate(self.barriers) if barrier.is_unknown]

@@ -34,7 +34,12 @@ FARTHEST = 1e9
 
 
 class PriorConfig(Strict):
-    """The prior set of theta: a box, in the units of theta."""
+    """The prior set of theta: a box, in the units of theta.
+
+    Attributes:
+        lower: the least value of every entry of theta.
+        upper: the greatest value of every entry of theta.
+    """
 
     lower: Vector
     upper: Vector
@@ -153,6 +158,7 @@ class AccelerationNoiseConfig(_ObservedErrors):
     Attributes:
         acceleration: bound on the error of controls [m/s2], or `auto`.
         slack: bound on the error of slacks [m/s2].
+        position: bound on the error of positions [m].
         velocity: bound on the error of the measured velocities of all bodies [m/s].
         neighbour_velocity: a larger one for those of other bodies [m/s].
         neighbour_acceleration: bound on the error of other bodies' accelerations, where rows use them [m/s2].

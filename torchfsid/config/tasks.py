@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
@@ -28,14 +28,22 @@ if TYPE_CHECKING:
 
 
 class NormSaturationConfig(Strict):
-    """Norm saturation: |uhat| <= limit [m/s]."""
+    """Norm saturation: |uhat| <= limit [m/s].
+
+    Attributes:
+        limit: the largest speed [m/s].
+    """
 
     kind: Literal["norm"] = "norm"
     limit: Positive
 
 
 class BoxSaturationConfig(Strict):
-    """Box saturation: |uhat_i| <= limit_i [m/s] on each axis."""
+    """Box saturation: |uhat_i| <= limit_i [m/s] on each axis.
+
+    Attributes:
+        limit: the largest speed along each axis [m/s].
+    """
 
     kind: Literal["box"] = "box"
     limit: PlanarVector
@@ -51,6 +59,18 @@ SaturationConfig = Annotated[NormSaturationConfig | BoxSaturationConfig, Field(d
 
 
 class _Task(Strict):
+    """A task.
+
+    Attributes:
+        unit: the unit of all entries of theta; empty if they have different ones.
+        is_place: theta is a place among the robots, if it has as many entries.
+        suspects: the keys to look at where the nominal control contradicts a log.
+    """
+
+    unit: ClassVar[str] = "m"
+    is_place: ClassVar[bool] = True
+    suspects: ClassVar[tuple[str, ...]] = ("kind",)
+
     @property
     def parameters(self) -> int:
         """p, the number of entries of theta."""
@@ -136,6 +156,13 @@ class GoalConfig(_Task):
         return self
 
     @property
+    def suspects(self) -> tuple[str, ...]:
+        if self.law == "constant_speed":
+            return ("speed", "tolerance")
+        beside = [key for key in ("damping", "velocity_loop") if getattr(self, key) is not None]
+        return ("gain", *beside, "saturation" if self.saturation is None else "saturation.limit")
+
+    @property
     def narrowed(self) -> Units:
         """The unit of the gain of robots with damping is that of robots that are driven by accelerations."""
         return {("gain",): "1/s" if self.damping is None else "1/s2"}
@@ -177,6 +204,7 @@ class UnknownGainGoalConfig(_Task):
     """`UnknownGainGoalTask`: theta = (k, k x_d)."""
 
     kind: Literal["goal_unknown_gain"] = "goal_unknown_gain"
+    unit: ClassVar[str] = ""
 
     @property
     def parameters(self) -> int:
@@ -193,6 +221,8 @@ class VelocityConfig(_Task):
     """`VelocityTask`: keep a constant velocity."""
 
     kind: Literal["velocity"] = "velocity"
+    unit: ClassVar[str] = "m/s"
+    is_place: ClassVar[bool] = False
 
     def build(self, bodies: Sequence[str]) -> Task:
         """The `VelocityTask`."""
@@ -202,11 +232,18 @@ class VelocityConfig(_Task):
 
 
 class FormationConfig(_Task):
-    """`FormationTask`: keep an offset to the body `leader`, with a known gain [1/s]."""
+    """`FormationTask`: keep an offset to the body `leader`, with a known gain [1/s].
+
+    Attributes:
+        gain: gain of the nominal control [1/s].
+        leader: the body whose position the offset is added to.
+    """
 
     kind: Literal["formation"] = "formation"
     gain: Positive
     leader: BodyName
+    is_place: ClassVar[bool] = False
+    suspects: ClassVar[tuple[str, ...]] = ("gain", "leader")
 
     @property
     def required(self) -> tuple[str, ...]:
@@ -225,10 +262,15 @@ class FormationConfig(_Task):
 
 
 class OrbitConfig(_Task):
-    """`OrbitTask`: circle a centre at a known rate [rad/s], positive if anticlockwise."""
+    """`OrbitTask`: circle a centre at a known rate [rad/s], positive if anticlockwise.
+
+    Attributes:
+        rate: angular rate [rad/s], positive if anticlockwise.
+    """
 
     kind: Literal["orbit"] = "orbit"
     rate: Number
+    suspects: ClassVar[tuple[str, ...]] = ("rate",)
 
     def build(self, bodies: Sequence[str]) -> Task:
         """The `OrbitTask` with these values."""
@@ -250,6 +292,7 @@ class PatrolConfig(_Task):
     gain: Positive
     rate: Number
     harmonics: Annotated[int, Field(strict=True, ge=1)] = 1
+    suspects: ClassVar[tuple[str, ...]] = ("gain", "rate", "harmonics")
 
     @property
     def parameters(self) -> int:

@@ -16,8 +16,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import islice
 from typing import NamedTuple
 
 import torch
@@ -110,6 +112,13 @@ class Consistency:
         """The samples, block by block."""
         for measurement in self._measurements:
             yield Block(times_of(measurement, self.robots), measurement)
+
+    def thinned(self, most: int) -> Consistency:
+        """The same for at most so many blocks, evenly spread over the log, with its `fastest`."""
+        step = math.ceil(sum(1 for _ in self._measurements) / most)
+        other = copy(self)
+        other.fastest, other._measurements = self.fastest, list(islice(self._measurements, 0, None, step))
+        return other
 
     @cached_property
     def fastest(self) -> float:

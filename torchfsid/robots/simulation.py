@@ -125,6 +125,7 @@ class Trajectory:
 
     @property
     def robots(self) -> int:
+        """The number of robots, which come first among the bodies."""
         return self.nominal.shape[-2]
 
     @property

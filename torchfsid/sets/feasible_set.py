@@ -31,9 +31,6 @@ from torchfsid.outcome import Status
 from torchfsid.programmes.differentiable import inscribed_ball, symmetric
 from torchfsid.sets import given, sampling, saved
 from torchfsid.sets.facets import Emptiness, Facets
-from torchfsid.sets.polygon import Polygon
-from torchfsid.sets.polyhedron import Polyhedron
-from torchfsid.sets.polytope import Polytope
 
 MAX_FACETS = 32
 """Facets kept; more are merged outward. Costs below 1 % of the volume (tests/test_feasible_set.py)."""
@@ -47,9 +44,9 @@ class FeasibleSet:
     `torch.func.vmap` does not run over sets: searches look at the numbers. The layers of `programmes` take sets, too.
 
     Attributes:
-        body: the sets with the batch flattened, a `Polygon` for p = 2, a `Polyhedron` for p = 3, else a `Polytope`.
+        body: the sets with the batch flattened, a `Polygon` for p = `dim` = 2, a `Polyhedron` for 3, else a `Polytope`.
         batch_shape: the shape of the batch.
-        outcome: a `Status` per item. An EMPTY item contains nothing and stays empty, whatever its body.
+        outcome: a `Status` per item, EMPTY where `is_empty`: it contains nothing and stays so, whatever its body.
         contradiction: the rows that no parameter satisfies together, for EMPTY items.
         last_cut: the time of the intersection that last shrank the set [s]; NaN if there was none.
         max_facets: the largest number of facets that are kept.
@@ -76,9 +73,8 @@ class FeasibleSet:
         batch, p = lower.shape[:-1], lower.shape[-1]
         if max_facets < 2 * p:
             raise InputError("max_facets", f"at least {2 * p}, the facets of the prior box", max_facets)
-        kind = Polygon if p == 2 else Polyhedron if p == 3 else Polytope
         return cls(
-            body=kind.from_box(lower.reshape(-1, p), upper.reshape(-1, p)),
+            body=saved.kind_of(p).from_box(lower.reshape(-1, p), upper.reshape(-1, p)),
             batch_shape=batch,
             outcome=torch.full(batch, Status.OK, device=lower.device),
             contradiction=Facets.none(batch, p, lower),

@@ -13,9 +13,15 @@ from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.sets.facets import Facets
 from torchfsid.sets.polygon import Polygon
+from torchfsid.sets.polyhedron import Polyhedron
 from torchfsid.sets.polytope import Polytope
 
 ROWS = ("A", "b", "time", "source")
+
+
+def kind_of(p: int) -> type[Any]:
+    """The class of the bodies of sets in R^p."""
+    return Polygon if p == 2 else Polyhedron if p == 3 else Polytope
 
 
 def mapped(value: Any, function: Callable[[Tensor], Tensor]) -> Any:
@@ -75,7 +81,7 @@ def read(state: Mapping[str, Any]) -> dict[str, Any]:
     body = {name.removeprefix("body."): part for name, part in state.items() if name.startswith("body.")}
     A, b, time, source = (state[f"contradiction.{name}"] for name in ROWS)
     return {
-        "body": (Polygon if body["A"].shape[-1] == 2 else Polytope)(**body),
+        "body": kind_of(body["A"].shape[-1])(**body),
         "batch_shape": state["outcome"].shape,
         "contradiction": Facets(Halfspaces(A, b), time, source),
         **{name: state[name] for name in ("outcome", "last_cut", "max_facets")},

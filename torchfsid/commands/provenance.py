@@ -1,0 +1,28 @@
+"""What results are made from: the version of the package, and the log, by its path and a digest of its content."""
+
+from __future__ import annotations
+
+import hashlib
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+
+def made_from(log: Path) -> dict[str, str]:
+    """The entry `made_from` of regions.json. The digest of a bag is that of its files, in the order of their names.
+
+    Raises:
+        OSError: the log cannot be read.
+    """
+    digest = hashlib.sha256()
+    for file in sorted(path for path in log.rglob("*") if path.is_file()) if log.is_dir() else [log]:
+        with file.open("rb") as content:
+            while block := content.read(1 << 20):
+                digest.update(block)
+    return {"torchfsid": _version(), "log": str(log), "sha256": digest.hexdigest()}
+
+
+def _version() -> str:
+    try:
+        return version("torchfsid")
+    except PackageNotFoundError:  # from a checkout that is not installed
+        return "unknown"
