@@ -204,7 +204,7 @@ def observe(found: dict[str, Any]) -> str:
     parts = [
         "## observe: a long log\n",
         f"`torchfsid observe` on a CSV file of {found['robots']} robots and {found['samples']} samples: µs of CPU per",
-        "sample (all robots). In blocks is what the command does. Sample by sample, with filterpy, is what a stream costs,",
+        "sample (all robots). In blocks is what the command does. Sample by sample, with filterpy, is a stream's cost,",
         f"measured on {found['short']} samples. Largest memory: {found['memory_mb']} MB.\n",
     ]
     rows = []
