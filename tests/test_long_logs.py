@@ -12,7 +12,8 @@ import yaml
 
 from tests.logs import bounded_errors, write_config, write_log
 from torchfsid.cli import main
-from torchfsid.commands.figures import MOST_POINTS, draw_observation
+from torchfsid.commands.figure_style import MOST_POINTS
+from torchfsid.commands.figures import draw_observation
 from torchfsid.config.observe import ObserveConfig
 from torchfsid.config.observers import LONG_LOG, UkfConfig
 from torchfsid.errors import ConfigError, LogError

@@ -36,7 +36,7 @@ from torchfsid.robots.measurement import Measurement
 HARDLY_CUT = 0.5
 """Share of its prior beyond which a set says little."""
 
-BLOCK = 1024
+BLOCK = 512
 """Samples that are read at once, at most."""
 
 BLOCK_ROWS = 200_000
