@@ -88,8 +88,7 @@ class Course:
         parts: sets Theta, each a batch (k,): those before the samples, and those that followed.
         which: for each sample and robot, the place of Theta after the sample in all `parts` one after the other.
         explained: whether a parameter of Theta explains the sample.
-        lost: whether the sample emptied the last level.
-        proofs: for each (sample, robot) that did, what `proof` says of the empty set.
+        proofs: for each (sample, robot) that emptied the last level, what `proof` says of the empty set.
     """
 
     levels: Levels
@@ -98,7 +97,6 @@ class Course:
     parts: list[FeasibleSet] = field(init=False)
     which: Int[Tensor, "S B"] = field(init=False)
     explained: Bool[Tensor, "S B"] = field(init=False)
-    lost: Bool[Tensor, "S B"] = field(init=False)
     proofs: dict[tuple[int, int], tuple] = field(init=False, default_factory=dict)
 
     def run(self, prior: FeasibleSet | None, proof: Callable[[FeasibleSet, int], tuple]) -> None:
@@ -109,15 +107,14 @@ class Course:
             proof: called with the sets and the robot, where a set is empty.
         """
         samples, robots = len(self.t), self.levels[-1].batch_shape[0]
-        every, now = torch.arange(robots), torch.zeros(robots, dtype=torch.long)
-        self.lost = torch.zeros(samples, robots, dtype=torch.bool)
+        every = torch.arange(robots)
         if samples == 1:  # no search: all robots are cut at once
-            explains, theta = self._cut(self.omega, self.t.expand(robots), now, prior, proof)
+            explains, theta = self._cut(self.omega, float(self.t), None, prior, proof)
             self.parts, self.which, self.explained = [theta], every.unsqueeze(0), explains.unsqueeze(0)
             return
-        self.omega = self.omega.shortened()
+        self.omega, now = self.omega.shortened(), torch.zeros(robots, dtype=torch.long)
         self.parts, self.which = [self.levels[-1]], every.repeat(samples, 1)
-        self.explained = torch.ones_like(self.lost)
+        self.explained = torch.ones(samples, robots, dtype=torch.bool)
         which, explained, known = self.which.numpy(), self.explained.numpy(), robots
         while bool((cut := (now := self._next_cuts(now)) < samples).any()):
             items = now.clamp(max=samples - 1) * robots + every
@@ -130,17 +127,24 @@ class Course:
             now = torch.where(cut, now + 1, samples)
 
     def _cut(
-        self, omega: Halfspaces, t: Tensor, now: Tensor, prior: FeasibleSet | None, proof: Callable
+        self, omega: Halfspaces, t: float | Tensor, now: Tensor | None, prior: FeasibleSet | None, proof: Callable
     ) -> tuple[Bool[Tensor, "B"], FeasibleSet]:
-        """Cut the sets by the samples `now` of the robots. Returns whether they are explained, and Theta."""
+        """Cut the sets by the samples `now` of the robots (None: the first). Returns `explained` of them, and Theta."""
         (*below, theta), explained = narrowed(self.levels, omega, t)
         if theta.any_empty:
             for robot in theta.is_empty.nonzero().flatten().tolist():
-                self.lost[now[robot], robot] = True
-                self.proofs[int(now[robot]), robot] = proof(theta, robot)
+                self.proofs[0 if now is None else int(now[robot]), robot] = proof(theta, robot)
             theta = theta.where(~theta.is_empty, self.levels[-1] if prior is None else prior)
         self.levels = (*below, theta)
         return explained, theta
+
+    @property
+    def lost(self) -> Bool[Tensor, "S B"]:
+        """Where a sample emptied the last level."""
+        found = torch.zeros_like(self.explained)
+        for place in self.proofs:
+            found[place] = True
+        return found
 
     def _next_cuts(self, start: Int[Tensor, "B"]) -> Int[Tensor, "B"]:
         """For each robot the first sample, from `start` on, of which some row cuts some level. S if there is none."""
