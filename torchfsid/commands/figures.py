@@ -27,7 +27,7 @@ from torchfsid.errors import FigureError, one_line
 from torchfsid.identification.kkt import CASES
 
 CASE_GREYS = ("#ededed", "#c6c6c6", "#9a9a9a", "#5f5f5f", "#222222")
-CASE_WORDS = ("none", "one", "several, parallel", "two", "three or more")
+CASE_WORDS = ("none", "one", "several, parallel", "two", "more")
 """How many rows are active in each of `CASES`."""
 
 FLAT = 1.9
