@@ -103,7 +103,10 @@ def merge(graph, n, lines, most, reach, at, frame, roof):
         f = _cheapest(graph, at, frame.y, roof)
         if f < 0:
             break
-        _, k = _raise(graph, f, at, frame.y, roof)
+        # From another vertex on, ties may be broken otherwise than when the cost was found.
+        roof.cost[f], k = _raise(graph, f, at, frame.y, roof)
+        if roof.cost[f] == np.inf:
+            continue
         n = _build(graph, n, k, reach, frame, roof)
         find_facets(graph.meets, n, at)
         for i in range(k):
@@ -190,6 +193,9 @@ def _raise(graph, f, at, y, roof):
         if i < 0 or not _is_inside(roof, i, left):
             return np.inf, k
         level, before, after = max(level, height[i]), before_in(i, left), after_in(i, left)
+        # Two facets of a polyhedron meet in one edge: round-off must not add another one.
+        if left > 3 and _meet_already(graph, ring[before], ring[after], at):
+            return np.inf, k
         for e, to in ((before, i), (i, after), (after, after_in(after, left))):
             total += _over_triangle(start[e], start[to], meet[i], base0, base1, base2)
         for j in range(3):
@@ -208,6 +214,20 @@ def _raise(graph, f, at, y, roof):
                 start[e, j], meet[e, j] = start[e + 1, j], meet[e + 1, j]
         new, left, changes = new + 1, left - 1, 2
         changed = before_in(i, left)
+
+
+@item
+@no_type_check
+def _meet_already(graph, f, other, at):
+    """Do two facets have an edge in common?"""
+    first, before, v = at[f], -1, at[f]
+    while True:
+        for j in range(3):
+            if graph.meets[v, j] == other:
+                return True
+        v, before = along(graph.meets, graph.near, v, before, f), v
+        if v == first:
+            return False
 
 
 @item
