@@ -13,14 +13,13 @@ from torchfsid.commands import report
 from torchfsid.commands.check import check
 from torchfsid.commands.command_line import use_one_thread
 from torchfsid.commands.declared_log import AUTO_FACTOR, DeclaredLog
-from torchfsid.commands.figures import draw_observation
 from torchfsid.commands.hypotheses import Hypotheses
 from torchfsid.commands.observe import Observation
 from torchfsid.commands.page.report import write_pages
 from torchfsid.commands.page.write import PAGE
 from torchfsid.commands.results_folder import ResultsFolder, write_json, write_whole
 from torchfsid.commands.safety_figure import draw_safety
-from torchfsid.commands.space_figure import draw_in_space
+from torchfsid.commands.space_figure import draw_regions
 from torchfsid.commands.terminal import console, status, track
 from torchfsid.config.documents import dump
 from torchfsid.config.models import dump_models
@@ -92,8 +91,7 @@ def observe_log(
             observation.run(out, shown, mcap, path if merge else None)
             with status("Drawing"):
                 seen = observation.log
-                draw = draw_in_space if seen.x.shape[-1] == 3 else draw_observation
-                draw(out, seen.x, seen.seen, seen.bodies)
+                draw_regions(out, seen.x, seen.seen, seen.bodies)
                 if observation.config.is_unknown:
                     draw_safety(out)
         except (OSError, FigureError) as problem:

@@ -16,10 +16,26 @@ from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from torchfsid.commands.figures import MOST_NAMED, _history, _regions, colour, plain_name, render, thinned
+from torchfsid.commands.figures import (
+    MOST_NAMED,
+    _history,
+    _regions,
+    colour,
+    draw_observation,
+    plain_name,
+    render,
+    thinned,
+)
 
 PLANES = ((0, 1), (0, 2), (1, 2))
 """The axes of the projections."""
+
+
+def draw_regions(
+    out: Path, x: Float[np.ndarray, "times bodies n"], seen: Bool[np.ndarray, "times bodies"], bodies: Sequence[str]
+) -> list[Path]:
+    """`draw_observation` in the plane, `draw_in_space` in space."""
+    return (draw_in_space if x.shape[-1] == 3 else draw_observation)(out, x, seen, bodies)
 
 
 def draw_in_space(
