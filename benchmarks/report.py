@@ -64,8 +64,8 @@ def polyhedra(found: dict[str, Any]) -> str:
         "[-10, 10]³ and updates of 12 half-spaces: intersect, drop redundant rows, merge to 32 facets; then volume,",
         f"centroid, diameter. Batches of {found['batch']} sets and one set alone; CPU time per set and update.",
         "`polytope` is the path in numpy for any dimension, which sets of three parameters took before. Qhull is asked",
-        "about the Chebyshev centre of HiGHS. Failed: as in geometry, against exact rationals. In `round` every row cuts,",
-        "and about a dozen facets are merged in each update.\n",
+        "about the Chebyshev centre of HiGHS. Failed: as in geometry, against exact rationals. In `round` every row",
+        "cuts, and about a dozen facets are merged in each update.\n",
     ]
     for name, rows in found["workloads"].items():
         parts.append(f"**{name if name in ('ordinary', 'round') else 'thin, width ' + name}**\n")
