@@ -15,7 +15,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchfsid.halfspaces import Halfspaces, dot
-from torchfsid.identification.kkt import KktSolution, outward_normals, solve_kkt
+from torchfsid.identification.kkt import KktSolution, solve_kkt
+from torchfsid.identification.normals import outward_normals
 from torchfsid.tolerances import CRITICAL_NORMALS, RANK_TOLERANCE
 
 

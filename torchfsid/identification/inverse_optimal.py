@@ -26,7 +26,7 @@ from torch import Tensor
 
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, dot
-from torchfsid.identification.kkt import OutwardNormals, outward_normals
+from torchfsid.identification.normals import OutwardNormals, outward_normals
 from torchfsid.identification.saturation import unclipped
 from torchfsid.robots.bounds import NoiseBound, RowErrors
 from torchfsid.robots.tasks import Saturation

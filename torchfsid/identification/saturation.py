@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.identification.kkt import outward_normals
+from torchfsid.identification.normals import outward_normals
 from torchfsid.kernels.saturation import AROUND
 from torchfsid.outcome import Status
 from torchfsid.robots.tasks import Saturation

@@ -141,7 +141,7 @@ def solve_motion(k, C, d, wish_known, rank, offset, projector, free, G, f):
 @item
 @no_type_check
 def outward_normals(angle, order, K, none, around, normals, generator):
-    """Fill the normals of `kkt.outward_normals` for K generators given by their angles.
+    """Fill the normals of `identification.normals` for K generators given by their angles.
 
     Args:
         angle: the generators' angles [rad], sorted here.
