@@ -33,7 +33,11 @@ from torchfsid.halfspaces import Halfspaces, dot
 from torchfsid.tolerances import RANK_TOLERANCE
 
 CASES = "ABCDE"
-"""Table I of the paper: A none active; B one; C several, rank 1; D two, rank 2; E three or more, rank 2."""
+"""Table I of the paper: A none active; B one; C several, rank 1; D two, rank 2; E three or more, rank 2.
+
+In space the rank may be 3, and the letters ask the same: is any row active (A), are the active rows independent (B one,
+D several), are they dependent (C of rank 1, E of a higher rank)? Rank 2 leaves theta free along a line, rank 3 nowhere.
+"""
 
 
 @dataclass(frozen=True)
@@ -103,7 +107,7 @@ def solve_unit(
     through = free @ torch.cat([C, d.unsqueeze(-1)], dim=-1)
 
     n_active = active.sum(-1)
-    several = torch.where(rank < n, 2, torch.where(n_active == n, 3, 4))
+    several = torch.where(rank < 2, 2, torch.where(n_active == rank, 3, 4))
     return KktSolution(
         G=through[..., :p],
         f=offset + through[..., p],
