@@ -132,7 +132,7 @@ def per_row(bound: float | Float[Tensor, "*batch"], like: Tensor) -> Float[Tenso
 
 def _fan(
     rows: Float[Tensor, "*batch m 2"], present: Bool[Tensor, "*batch m"], angle: Float[Tensor, "*batch m"]
-) -> tuple[Float[Tensor, "*batch k*m 2"], Bool[Tensor, "*batch k*m"]]:
+) -> tuple[Float[Tensor, "*batch g 2"], Bool[Tensor, "*batch g"]]:
     """Rows turned by fractions of an angle, whose cone holds all of the rows turned by up to the angle."""
     generators = torch.cat([_turned(rows, fraction * angle) for fraction in SPREAD], dim=-2)
     return generators, torch.cat([present] * len(SPREAD), dim=-1)
@@ -146,7 +146,7 @@ def _turned(rows: Float[Tensor, "*batch m 2"], angle: Float[Tensor, "*batch m"])
 
 def _pyramid(
     rows: Float[Tensor, "*batch m 3"], present: Bool[Tensor, "*batch m"], angle: Float[Tensor, "*batch m"]
-) -> tuple[Float[Tensor, "*batch k*m 3"], Bool[Tensor, "*batch k*m"]]:
+) -> tuple[Float[Tensor, "*batch g 3"], Bool[Tensor, "*batch g"]]:
     """The edges of a pyramid around all of the unit rows turned by up to an angle. A row that is exact comes once.
 
     The k = `RING` edges are at the angle atan(tan(angle)/cos(pi/k)), so that the faces touch the circular cone. From a
