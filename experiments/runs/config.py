@@ -14,6 +14,7 @@ from pydantic import Field, model_validator
 
 from torchfsid.config.avoidance import AvoidanceConfig
 from torchfsid.config.barriers import BarrierConfig
+from torchfsid.config.dimensions import dimension_of, require_one_dimension
 from torchfsid.config.documents import Strict, wrong
 from torchfsid.config.observe import AnyNoiseConfig, Dynamics, require_one_order
 from torchfsid.config.observers import PriorConfig, UkfConfig
@@ -135,6 +136,11 @@ class ExperimentConfig(Strict):
         return round(self.duration / self.dt)
 
     @property
+    def dimension(self) -> int:
+        """Are the robots in the plane (2) or in space (3)?"""
+        return dimension_of(self.task, self.prior)
+
+    @property
     def sets(self) -> tuple[SetKind, ...]:
         """The kinds of set that can be computed. The paper's needs exact rows and a nominal control without limits."""
         exact = not self.task.is_clipped and not any(barrier.uncertain for barrier in self.barriers)
@@ -160,8 +166,7 @@ class ExperimentConfig(Strict):
             )
         if self.set not in self.sets:
             raise wrong("critical_region needs exact rows and no clipped nominal control, take inverse_optimal", "set")
-        if len(self.prior.lower) != self.task.parameters:
-            raise wrong(f"a goal has {self.task.parameters} entries, lower has {len(self.prior.lower)}", "prior")
+        require_one_dimension(self.dimension, self.barriers)
         require_steps(self.duration, self.dt)
         return self
 

@@ -53,7 +53,7 @@ def _worst(true: Trajectory, config: SceneConfig, random: np.random.Generator) -
     # A length of zero needs no direction.
     turns = torch.cartesian_prod(compass if noise.position else compass[:1], compass if noise.velocity else compass[:1])
     candidates = goals.repeat(len(turns), 1)
-    model = ObservationModel(config.task.build(config.bodies), barriers, noise=config.noise.build())
+    model = ObservationModel(config.task.build(config.bodies, config.dimension), barriers, noise=config.noise.build())
     prior = config.prior.build(len(candidates))
     x, u = true.x.clone(), true.u.clone()
     x[0, :robots] += _on_circle(random, noise.position, (robots,))

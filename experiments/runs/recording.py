@@ -66,7 +66,7 @@ class SimulatedScene:
 
 def simulate_scene(config: SceneConfig) -> SimulatedScene:
     """Run the scene's robots from rest in closed loop, and measure them with the configured errors."""
-    task = config.task.build(config.bodies)
+    task = config.task.build(config.bodies, config.dimension)
     barriers: list[Barrier] = [barrier.build(config.bodies) for barrier in config.barriers]
     start = _points([robot.start for robot in config.robots])
     true = simulate(

@@ -177,7 +177,7 @@ def _require_viewable(mcap: Path, models: Mapping[str, ObserveConfig], merge: bo
 def _read(path: Path, models: Mapping[str, ObserveConfig]) -> Log:
     first = next(iter(models.values()))
     heading = None if first.body is None else first.body.heading
-    return read_log(path, first.bag, heading, first.log)
+    return read_log(path, first.bag, heading, first.log, in_space=first.dimension == 3)
 
 
 def _ready(models: Mapping[str, DeclaredLog]) -> Observation | Hypotheses:

@@ -96,6 +96,11 @@ class _KeepsDistance(Strict):
         return self
 
     @property
+    def dimension(self) -> int | None:
+        """The dimension in which the rows are, 2 or 3. None: in both."""
+        return None
+
+    @property
     def uses_radius(self) -> bool:
         """Do the rows need the bodies' radii?"""
         return self.margin is not None

@@ -17,7 +17,7 @@ from torchfsid.config.quantities import (
     Flag,
     NonNegative,
     NonNegativeOrInterval,
-    PlanarVector,
+    Place,
     Positive,
     PositiveOrInterval,
     Units,
@@ -46,6 +46,11 @@ class _RobotsOwn(Strict):
     narrowed: ClassVar[Units] = {}
 
     @property
+    def dimension(self) -> int | None:
+        """The dimension in which the rows are, 2 or 3. None: in both."""
+        return None
+
+    @property
     def uses_radius(self) -> bool:
         return False
 
@@ -66,8 +71,12 @@ class SpeedBoxConfig(_RobotsOwn):
     """
 
     kind: Literal["speed_box"] = "speed_box"
-    limit: Annotated[tuple[Positive, ...], Field(min_length=2, max_length=2)]
+    limit: Annotated[tuple[Positive, ...], Field(min_length=2, max_length=3)]
     soft: Flag = False
+
+    @property
+    def dimension(self) -> int:
+        return len(self.limit)
 
     def build(self, bodies: Sequence[str]) -> Barrier:
         """The barrier. It does not depend on the bodies."""
@@ -85,9 +94,13 @@ class AccelerationBoxConfig(_RobotsOwn):
     """
 
     kind: Literal["acceleration_box"] = "acceleration_box"
-    limit: Annotated[tuple[Positive, ...], Field(min_length=2, max_length=2)]
+    limit: Annotated[tuple[Positive, ...], Field(min_length=2, max_length=3)]
     soft: Flag = False
     is_second_order: ClassVar[bool] = True
+
+    @property
+    def dimension(self) -> int:
+        return len(self.limit)
 
     def build(self, bodies: Sequence[str]) -> Barrier:
         """The barrier. It does not depend on the bodies."""
@@ -110,6 +123,10 @@ class SpeedPolygonConfig(_RobotsOwn):
     limit: Positive
     soft: Flag = False
 
+    @property
+    def dimension(self) -> int:
+        return 2
+
     def build(self, bodies: Sequence[str]) -> Barrier:
         """The barrier. It does not depend on the bodies."""
         from torchfsid.robots.barriers import SpeedPolygon
@@ -129,12 +146,16 @@ class ArenaConfig(_RobotsOwn):
     """
 
     kind: Literal["arena"] = "arena"
-    lower: PlanarVector
-    upper: PlanarVector
+    lower: Place
+    upper: Place
     margin: NonNegative = 0.0
     class_k: ClassKConfig
     soft: Flag = False
     suspects: ClassVar[tuple[str, ...]] = ("class_k.gain", "margin", "lower", "upper")
+
+    @property
+    def dimension(self) -> int:
+        return len(self.lower)
 
     @model_validator(mode="after")
     def _is_a_box(self) -> ArenaConfig:
@@ -214,6 +235,10 @@ class OrcaConfig(Strict):
         if self.push_away and isinstance(self.margin, tuple):
             raise wrong("expected a known margin with push_away", "margin")
         return self
+
+    @property
+    def dimension(self) -> int:
+        return 2
 
     @property
     def uses_radius(self) -> bool:

@@ -42,6 +42,8 @@ Flag = Annotated[bool, Field(strict=True)]
 BodyName = Annotated[str, BeforeValidator(_name)]
 Vector = Annotated[tuple[Number, ...], Field(min_length=1)]
 PlanarVector = Annotated[tuple[Number, ...], Field(min_length=2, max_length=2)]
+Place = Annotated[tuple[Number, ...], Field(min_length=2, max_length=3)]
+"""A vector in the plane or in space."""
 
 
 def _one_or_two(value: object) -> str:
