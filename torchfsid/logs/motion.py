@@ -77,8 +77,7 @@ class Motion(NamedTuple):
         low, high = float(self.x[:, 2].min()), float(self.x[:, 2].max())
         if not high - low <= LEVEL:
             raise LogError(
-                f"{where}: the height changes from {low:g} to {high:g} m, and the prior says that robots are in the plane "
-                "(robots in space: three entries)"
+                f"{where}: robots in the plane (a prior of two entries), but the height changes from {low:g} to {high:g} m"
             )
 
 

@@ -1,9 +1,9 @@
 """Logs of motion capture, in the forms in which programs export them (`exports`).
 
 Cells that are empty are gaps. Rows that repeat another one exactly are left out and counted. With the y-axis up, the
-plane is (x, -z), seen from above, and positions in space are (x, -z, y). Bodies of one table have its times, and are missing where their cells are empty.
-Files of one body each have the same times if most of their times are shared with another file. Otherwise they are
-resampled (`resampling`). Times since 1970 are counted from the first.
+plane is (x, -z), seen from above, and positions in space are (x, -z, y). Bodies of one table have its times, and are
+missing where their cells are empty. Files of one body each have the same times if most of their times are shared with
+another file. Otherwise they are resampled (`resampling`). Times since 1970 are counted from the first.
 """
 
 from __future__ import annotations
