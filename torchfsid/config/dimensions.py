@@ -17,7 +17,7 @@ def dimension_of(task: TaskConfig, prior: PriorConfig) -> int:
     entries = len(prior.lower)
     possible = {task.parameters(n): n for n in task.dimensions}
     if entries not in possible:
-        expected = " and ".join(f"{p} parameters {WORDS[n]}" for p, n in possible.items())
+        expected = " and ".join(f"{p} {WORDS[n]}" for p, n in possible.items()).replace(" ", " parameters ", 1)
         raise wrong(f"task {task.kind!r} has {expected}, lower and upper have {entries}", "prior")
     return possible[entries]
 

@@ -76,9 +76,8 @@ class Motion(NamedTuple):
         """
         low, high = float(self.x[:, 2].min()), float(self.x[:, 2].max())
         if not high - low <= LEVEL:
-            raise LogError(
-                f"{where}: robots in the plane (a prior of two entries), but the height changes from {low:g} to {high:g} m"
-            )
+            told = "robots in the plane (a prior of two entries)"
+            raise LogError(f"{where}: {told}, but the height changes from {low:g} to {high:g} m")
 
 
 def rotation_of(x: float, y: float, z: float, w: float) -> Float[np.ndarray, "3 3"] | None:
