@@ -15,6 +15,7 @@ from torchfsid.config.avoidance import AvoidanceConfig, ClassKConfig, SecondOrde
 from torchfsid.config.documents import Strict, wrong
 from torchfsid.config.quantities import (
     Flag,
+    Lengths,
     NonNegative,
     NonNegativeOrInterval,
     Place,
@@ -71,7 +72,7 @@ class SpeedBoxConfig(_RobotsOwn):
     """
 
     kind: Literal["speed_box"] = "speed_box"
-    limit: Annotated[tuple[Positive, ...], Field(min_length=2, max_length=3)]
+    limit: Lengths
     soft: Flag = False
 
     @property
@@ -94,7 +95,7 @@ class AccelerationBoxConfig(_RobotsOwn):
     """
 
     kind: Literal["acceleration_box"] = "acceleration_box"
-    limit: Annotated[tuple[Positive, ...], Field(min_length=2, max_length=3)]
+    limit: Lengths
     soft: Flag = False
     is_second_order: ClassVar[bool] = True
 
@@ -279,6 +280,42 @@ class OrcaConfig(Strict):
         )
 
 
+class BufferedVoronoiConfig(_RobotsOwn):
+    """`BufferedVoronoi`: the cells of the Crazyflie's firmware.
+
+    Attributes:
+        ellipsoid: radii of one robot's ellipsoid [m].
+        horizon: the time for which a velocity is kept [s].
+        max_speed: the largest speed on every axis [m/s].
+        sidestep: distance of a wall below which the firmware may turn the command [m]; 0 if it was switched off.
+    """
+
+    kind: Literal["buffered_voronoi"] = "buffered_voronoi"
+    ellipsoid: Lengths
+    horizon: Positive
+    max_speed: Positive
+    sidestep: NonNegative = 0.25
+    soft: Flag = False
+    uncertain: ClassVar[bool] = True
+
+    @model_validator(mode="after")
+    def _can_move(self) -> BufferedVoronoiConfig:
+        if self.horizon * self.max_speed <= self.sidestep:
+            reach = f"horizon * max_speed = {self.horizon * self.max_speed:g} m"
+            raise wrong(f"expected less than {reach}: every command could be turned", "sidestep")
+        return self
+
+    @property
+    def dimension(self) -> int:
+        return len(self.ellipsoid)
+
+    def build(self, bodies: Sequence[str]) -> Barrier:
+        """The barrier. It does not depend on the bodies' names."""
+        from torchfsid.robots.buffered_voronoi import BufferedVoronoi
+
+        return BufferedVoronoi(self.ellipsoid, self.horizon, self.max_speed, self.sidestep, self.soft)
+
+
 SECOND_ORDER = "avoidance, order: 2"
 
 
@@ -299,6 +336,7 @@ BarrierConfig = Annotated[
     | Annotated[SpeedBoxConfig, Tag("speed_box")]
     | Annotated[AccelerationBoxConfig, Tag("acceleration_box")]
     | Annotated[SpeedPolygonConfig, Tag("speed_polygon")]
-    | Annotated[ArenaConfig, Tag("arena")],
+    | Annotated[ArenaConfig, Tag("arena")]
+    | Annotated[BufferedVoronoiConfig, Tag("buffered_voronoi")],
     Discriminator(_kind),
 ]

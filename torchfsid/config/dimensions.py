@@ -28,3 +28,5 @@ def require_one_dimension(dimension: int, barriers: Sequence[BarrierConfig]) -> 
         if barrier.dimension not in (None, dimension):
             got = f"{barrier.kind!r} is {WORDS[barrier.dimension or dimension]}"
             raise wrong(f"the prior says that robots are {WORDS[dimension]}, and {got}", f"barriers[{i}]")
+        if barrier.kind == "arena" and any(getattr(other, "sidestep", 0.0) > 0 for other in barriers):
+            raise wrong("a sidestep at a wall of an arena is not modelled: expected sidestep: 0", f"barriers[{i}]")
