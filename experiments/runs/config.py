@@ -18,7 +18,7 @@ from torchfsid.config.dimensions import dimension_of, require_one_dimension
 from torchfsid.config.documents import Strict, wrong
 from torchfsid.config.observe import AnyNoiseConfig, Dynamics, require_one_order
 from torchfsid.config.observers import PriorConfig, UkfConfig
-from torchfsid.config.quantities import BodyName, NonNegative, Number, PlanarVector, Positive, known
+from torchfsid.config.quantities import BodyName, NonNegative, Number, Place, PlanarVector, Positive, known
 from torchfsid.config.tasks import GoalConfig
 from torchfsid.config.unknown_numbers import unknown_numbers
 
@@ -44,8 +44,8 @@ class RobotConfig(Strict):
     """
 
     name: BodyName
-    start: PlanarVector
-    goal: PlanarVector
+    start: Place
+    goal: Place
 
 
 class ObstacleConfig(Strict):
@@ -57,7 +57,7 @@ class ObstacleConfig(Strict):
     """
 
     name: BodyName
-    position: PlanarVector
+    position: Place
 
 
 class MeasurementNoiseConfig(Strict):
@@ -213,6 +213,13 @@ class SceneConfig(ExperimentConfig):
         names = self.bodies
         if repeated := [name for i, name in enumerate(names) if name in names[:i]]:
             raise wrong(f"two bodies are called {repeated[0]!r}", "robots, obstacles")
+        places = {
+            f"robots[{i}].{name}": getattr(of, name) for i, of in enumerate(self.robots) for name in ("start", "goal")
+        }
+        places |= {f"obstacles[{i}].position": of.position for i, of in enumerate(self.obstacles)}
+        for path, place in places.items():
+            if len(place) != self.dimension:
+                raise wrong(f"expected {self.dimension} entries as in the prior, got {list(place)}", path)
         for i, robot in enumerate(self.robots):
             self._require_in_prior(robot.goal, f"robots[{i}].goal")
         if self.radius is None and any(barrier.uses_radius for barrier in self.barriers):
@@ -221,6 +228,8 @@ class SceneConfig(ExperimentConfig):
         noise = self.measurement_noise
         if self.dynamics == "single_integrator" and noise.acceleration > 0:
             raise wrong("needs dynamics: double_integrator", "measurement_noise.acceleration")
+        if self.dimension == 3 and noise.shape == "adversarial":
+            raise wrong("the adversary knows robots in the plane only", "measurement_noise.shape")
         if self.dynamics == "double_integrator" and noise.shape == "adversarial":
             raise wrong("the adversary knows single integrators only", "measurement_noise.shape")
         if self.expected and len(self.robots) > 1:
