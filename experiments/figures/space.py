@@ -22,18 +22,14 @@ def draw_snapshots(results: Results, config: SceneConfig) -> Figure:
     figure = Figure(figsize=(10.0, 3.3 * count + 0.7), layout="constrained")
     all_axes = figure.subplots(count, 3, squeeze=False)
     reach = np.concatenate([*results.paths.values(), results.goals])
-    for i, (of_snapshot, t) in enumerate(zip(all_axes, config.snapshots, strict=True)):
+    for of_snapshot, t in zip(all_axes, config.snapshots, strict=True):
         k = results.at(t)
         for axes, plane, view in zip(of_snapshot, PLANES, VIEWS, strict=True):
             _draw(axes, results, config, k, plane)
             low, high = reach.min(0)[list(plane)] - 0.3, reach.max(0)[list(plane)] + 0.3
             axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
             axes.set(xlabel=f"{'xyz'[plane[0]]} [m]", ylabel=f"{'xyz'[plane[1]]} [m]")
-            if i == 0:
-                axes.set_title(view)
-        of_snapshot[0].annotate(
-            f"t = {results.t[k]:.2f} s", (0.03, 0.97), xycoords="axes fraction", va="top", fontweight="bold"
-        )
+            axes.set_title(f"t = {results.t[k]:.2f} s, {view}" if plane == PLANES[0] else view)
     drawing.headline(figure, f"{config.title}: {SET_NAMES[config.set]} of each goal, and its shadows")
     handles = [
         drawing.marker("o", "0.45", ms=7),
