@@ -61,7 +61,7 @@ def test_observe(log: Path, tmp_path: Path) -> None:
         assert region["status"] == "ok"
         assert (np.array(region["A"]) @ goal - region["b"]).max() < 1e-9
         assert len(region["centroid"]) == 3
-        assert region["diameter"] < 1e-3
+        assert region["diameter"] < 1e-2
     assert (tmp_path / "out" / "regions.png").stat().st_size > 10_000
     header = (tmp_path / "out" / "estimates.csv").read_text().splitlines()[0]
     assert "hybrid_2" in header
@@ -73,7 +73,7 @@ def test_check_and_hypotheses(log: Path, tmp_path: Path, capsys: pytest.CaptureF
     path = write_config(tmp_path / "config.yaml", {"tasks": tasks, **rest})
     assert main(["check", str(log), "--config", str(path), "--out", str(tmp_path / "out")]) == 0
     right, wrong = (json.loads((tmp_path / "out" / name / "check.json").read_text()) for name in ("right", "wrong"))
-    assert max(right["smallest_bounds"].values()) < 1e-6 < min(wrong["smallest_bounds"].values())
+    assert right["smallest_bound"] < 1e-6 < wrong["smallest_bound"]
 
 
 @pytest.mark.parametrize(
