@@ -267,7 +267,7 @@ class FormationTask:
 
 @dataclass(frozen=True)
 class OrbitTask:
-    """Circle a centre theta [m] at a known angular rate [rad/s]: uhat = rate J (x - theta), J a turn by 90 deg, in the plane."""
+    """Circle a centre theta [m] in the plane at a known rate [rad/s]: uhat = rate J (x - theta), J a turn by 90 deg."""
 
     rate: float | Tensor
     parameter_names: tuple[str, ...] = ("centre_x", "centre_y")
