@@ -234,7 +234,7 @@ def evidence_in_space(A, b, hard, C, d, u, usable, bound, angles, ball, drift, p
     without limits on the nominal control.
     """
     B, m = b.shape
-    p, fan, most = C.shape[2], angles[:, :0] if paper else angles, 0
+    p, fan, most = C.shape[2], angles[:, :0] if paper else angles, 1  # a row of padding, where nothing is said
     generators = m * RING if fan.shape[1] > 0 else m
     R = (m if paper else 0) + len(FAN) + EDGES
     row_A, row_b, row_source = np.zeros((B, R, p)), np.ones((B, R)), np.full((B, R), -1)
