@@ -10,6 +10,7 @@ import pytest
 import torch
 import yaml
 
+import torchfsid as fsid
 from experiments.__main__ import main as experiments
 from tests.bag_writer import odometry, write_bag
 from tests.logs import write_config, write_log
@@ -23,10 +24,12 @@ from torchfsid.config.observe import ObserveConfig
 from torchfsid.errors import ConfigError, LogError
 from torchfsid.logs.read import read_log
 from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
+from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.ellipsoid import Ellipsoid
 from torchfsid.robots.simulation import simulate
-from torchfsid.robots.tasks import GoalTask
+from torchfsid.robots.tasks import AffineTask, GoalTask
+from torchfsid.sets.feasible_set import FeasibleSet
 
 SECOND = 1_000_000_000
 START = torch.tensor([[-1.0, 0.1, 0.5], [1.0, -0.1, 0.6], [0.1, 1.0, 0.4]], dtype=torch.float64)
@@ -65,6 +68,16 @@ def test_observe(log: Path, tmp_path: Path) -> None:
     assert (tmp_path / "out" / "regions.png").stat().st_size > 10_000
     header = (tmp_path / "out" / "estimates.csv").read_text().splitlines()[0]
     assert "hybrid_2" in header
+
+
+def test_objects_in_place_of_sections(log: Path) -> None:
+    """A task of the package, and an own one that does not say whether it is in space."""
+    own = AffineTask(torch.eye(3, dtype=torch.float64), lambda measurement: -measurement.x, ("a", "b", "c"))
+    corner = torch.full((3,), 2.0, dtype=torch.float64)
+    for task in (GoalTask(1.0, 3), own):
+        barrier = Ellipsoid(CollisionAvoidance(ClassK(2.0), 1.0), AXES)
+        found = fsid.observe(str(log), task, [barrier], FeasibleSet.from_box(-corner, corner), NoiseBound(1e-6))
+        assert bool(found.sets.contains(GOALS, 1e-9).all())
 
 
 def test_check_and_hypotheses(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 
 from torchfsid.config.avoidance import AvoidanceConfig
 from torchfsid.config.barriers import BarrierConfig
-from torchfsid.config.dimensions import dimension_of, require_one_dimension
+from torchfsid.config.dimensions import dimensions_of, require_one_dimension
 from torchfsid.config.documents import Strict, wrong
 from torchfsid.config.observe import AnyNoiseConfig, Dynamics, require_one_order
 from torchfsid.config.observers import PriorConfig, UkfConfig
@@ -138,7 +138,7 @@ class ExperimentConfig(Strict):
     @property
     def dimension(self) -> int:
         """Are the robots in the plane (2) or in space (3)?"""
-        return dimension_of(self.task, self.prior)
+        return dimensions_of(self.task, self.prior)[0]
 
     @property
     def sets(self) -> tuple[SetKind, ...]:
@@ -166,7 +166,7 @@ class ExperimentConfig(Strict):
             )
         if self.set not in self.sets:
             raise wrong("critical_region needs exact rows and no clipped nominal control, take inverse_optimal", "set")
-        require_one_dimension(self.dimension, self.barriers)
+        require_one_dimension((self.dimension,), self.barriers)
         require_steps(self.duration, self.dt)
         return self
 

@@ -77,7 +77,7 @@ class DeclaredLog:
 
     def __post_init__(self) -> None:
         config = self.config
-        if self.log.x.shape[-1] != config.dimension:
+        if self.log.x.shape[-1] not in config.dimensions:
             told = f"prior: {len(config.prior.lower)} entries for a task {config.task.kind!r}"
             there = "has positions z" if config.dimension == 2 else "has no positions z"
             raise ConfigError(f"{told}: robots {WORDS[config.dimension]}, but the log {there}")
@@ -106,7 +106,7 @@ class DeclaredLog:
         self.robots = config.robots(self.log.bodies)
         for robot in config.truth or {}:
             require_body(f"truth.{robot}", robot, self.robots)
-        self.task = config.task.build(self.log.bodies, config.dimension)
+        self.task = config.task.build(self.log.bodies, self.log.x.shape[-1])
         self.barriers = config.build_barriers(self.log.bodies, self._radius)
         self.prior = config.prior.build(len(self.robots))
 
@@ -222,7 +222,7 @@ class DeclaredLog:
         other = copy(self)
         for number, interval in zip(self.config.unknown_numbers, intervals, strict=True):
             other.config = replaced(other.config, number.path, interval)
-        other.task = other.config.task.build(self.log.bodies, other.config.dimension)
+        other.task = other.config.task.build(self.log.bodies, self.log.x.shape[-1])
         other.barriers = other.config.build_barriers(self.log.bodies, self._radius)
         return other
 

@@ -15,7 +15,7 @@ from torchfsid.config.avoidance import AvoidanceConfig
 from torchfsid.config.bags import BagConfig
 from torchfsid.config.barriers import BarrierConfig
 from torchfsid.config.bodies import UnicycleConfig
-from torchfsid.config.dimensions import dimension_of, require_one_dimension
+from torchfsid.config.dimensions import dimensions_of, require_one_dimension
 from torchfsid.config.documents import Strict, wrong
 from torchfsid.config.given import GIVEN, GivenBarrier, GivenTask, a_barrier, a_prior, a_task, bounds, is_object
 from torchfsid.config.motion_capture import LogConfig
@@ -119,7 +119,7 @@ class ObserveConfig(Strict):
 
     @model_validator(mode="after")
     def _fits_together(self) -> ObserveConfig:
-        require_one_dimension(self.dimension, self.barriers)
+        require_one_dimension(self.dimensions, self.barriers)
         for robot, theta in (self.truth or {}).items():
             if len(theta) != (expected := len(self.prior.lower)):
                 raise wrong(f"task '{self.task.kind}' has {expected} parameters, got {len(theta)}", f"truth.{robot}")
@@ -201,9 +201,14 @@ class ObserveConfig(Strict):
         return self.dynamics == "double_integrator"
 
     @property
+    def dimensions(self) -> tuple[int, ...]:
+        """Where the robots may be: in the plane (2), in space (3), or either, if an own task does not say it."""
+        return dimensions_of(self.task, self.prior)
+
+    @property
     def dimension(self) -> int:
-        """Are the robots in the plane (2) or in space (3)?"""
-        return dimension_of(self.task, self.prior)
+        """Are the robots in the plane (2) or in space (3)? The plane, if neither is said."""
+        return self.dimensions[0]
 
     def with_bound(self, bound: float) -> ObserveConfig:
         """The same configuration with another bound on the error of controls [`noise.unit`]."""

@@ -34,8 +34,7 @@ class Saturation:
 
     Attributes:
         shape: `norm` for |uhat| <= v, `box` for |uhat_i| <= v_i.
-        limits: the v_i, one per axis, in the units of the control. For `norm` all are v. Infinite if there is a dead
-            zone only.
+        limits: the v_i, in the units of the control. For `norm` all are v. Infinite if there is a dead zone only.
         dead_speed: the size below which the control is zero, in its units. For a goal it is the gain times the radius
             of the dead zone.
     """
@@ -134,8 +133,7 @@ class GoalTask:
         dimension: 2 in the plane, 3 in space.
         saturation: how the nominal control is clipped.
         gain_error: a bound on the error of the gain.
-        damping: of the velocity v, before clipping [1/s].
-        loop: of the velocity v, after clipping [1/s] (`in_velocity_loop`).
+        damping, loop: of the velocity v, before and after clipping [1/s] (`in_velocity_loop`).
     """
 
     gain: float | Tensor
@@ -285,8 +283,7 @@ class OrbitTask:
 class PatrolTask:
     """Follow a closed path r(t) = c + sum_k (a_k cos(k w t) + b_k sin(k w t)), w the `rate` [rad/s].
 
-    The nominal control uhat = gain (r - x) + dr/dt is linear in theta = (c, a_1, b_1, ...) [m], p = n (1 + 2
-    `harmonics`), with n the `dimension`.
+    uhat = gain (r - x) + dr/dt is linear in theta = (c, a_1, b_1, ...) [m], p = `dimension` (1 + 2 `harmonics`).
     """
 
     gain: float
