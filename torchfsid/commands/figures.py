@@ -50,7 +50,7 @@ def draw_observation(
         FigureError: a file is missing or damaged, or matplotlib fails.
         OSError: a figure cannot be written.
     """
-    final, history = _regions(out / "regions.json"), _history(out / "estimates.csv")
+    final, history = final_regions(out / "regions.json"), history_of(out / "estimates.csv")
     marks, clock = marks or Marks(), Clock.of(float(next(iter(history.values()))["t"][0]))
     width, height = extent(final, x[..., :2], seen, marks)
     is_flat = width > FLAT * height
@@ -68,9 +68,9 @@ def draw_observation(
         map_axes = figure.add_subplot(places[0])
         unfinished = draw_map(map_axes, final, x[..., :2], seen, bodies, marks)
         sizes = figure.add_subplot(places[1])
-        _draw_sizes(sizes, history, final, clock, marks.unit)
+        draw_sizes(sizes, history, final, clock, marks.unit)
         cases = figure.add_subplot(places[2], sharex=sizes)
-        _draw_cases(cases, history, clock)
+        draw_cases(cases, history, clock)
         if not is_flat:
             sizes.tick_params(labelbottom=False)
             sizes.set_xlabel("")
@@ -83,7 +83,7 @@ def draw_observation(
     return render(out / "regions", size, draw)
 
 
-def _regions(path: Path) -> dict[str, Any]:
+def final_regions(path: Path) -> dict[str, Any]:
     """The robots' final sets."""
     try:
         robots = json.loads(path.read_text(encoding="utf-8"))["robots"]
@@ -100,7 +100,7 @@ def _regions(path: Path) -> dict[str, Any]:
         raise FigureError(f"{path}: missing or damaged: {one_line(error)}") from error
 
 
-def _history(path: Path) -> dict[str, dict[str, np.ndarray]]:
+def history_of(path: Path) -> dict[str, dict[str, np.ndarray]]:
     """For each robot: times [s], diameters (NaN if the set is empty) and indices of cases (NaN if not measured)."""
     columns: dict[str, tuple[list[float], list[float], list[float]]] = defaultdict(lambda: ([], [], []))
     number = {"": math.nan, **{case: float(i) for i, case in enumerate(CASES)}}
@@ -125,7 +125,7 @@ def _history(path: Path) -> dict[str, dict[str, np.ndarray]]:
     }
 
 
-def _draw_sizes(axes: Axes, history: dict, final: dict[str, Any], clock: Clock, unit: str) -> None:
+def draw_sizes(axes: Axes, history: dict, final: dict[str, Any], clock: Clock, unit: str) -> None:
     count = len(history)
     for i, (robot, of) in enumerate(history.items()):
         t, diameter = thinned(of["t"]) - clock.start, thinned(of["diameter"])
@@ -162,7 +162,7 @@ def _draw_sizes(axes: Axes, history: dict, final: dict[str, Any], clock: Clock, 
         axes.legend(title="robot", ncols=1 + count // 6, fontsize=8)
 
 
-def _draw_cases(axes: Axes, history: dict[str, dict[str, np.ndarray]], clock: Clock) -> None:
+def draw_cases(axes: Axes, history: dict[str, dict[str, np.ndarray]], clock: Clock) -> None:
     cases = np.stack([thinned(of["case"]) for of in history.values()])
     t = thinned(next(iter(history.values()))["t"]) - clock.start
     ends = np.append(t, t[-1] + (t[-1] - t[-2] if len(t) > 1 else 1.0))

@@ -1,24 +1,24 @@
-"""The figure of an observed log of robots in space, from its saved results.
+"""The figure of an observed log of robots in space, from its saved results: three maps, sizes and cases over time.
 
-Three projections (xy, xz, yz) of the trajectories and of the final sets, whose shadows are the convex hulls of the
-projected vertices, with a cross at the centroid. Beside them the sizes over time.
+Each map is that of the plane (`map_panel`), of everything seen along one axis. A set is seen as its shadow, the convex
+hull of its projected vertices. So a point outside of one of the shadows is outside of the set.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from torchfsid.commands.figure_style import MOST_NAMED, colour, plain_name, render, thinned
-from torchfsid.commands.figures import _history, _regions, draw_observation
-from torchfsid.commands.map_panel import Marks
+from torchfsid.commands.clock import Clock
+from torchfsid.commands.figure_style import render
+from torchfsid.commands.figures import draw_cases, draw_observation, draw_sizes, final_regions, history_of
+from torchfsid.commands.map_panel import Marks, draw_map, finish_map
 
 PLANES = ((0, 1), (0, 2), (1, 2))
 """The axes of the projections."""
@@ -29,7 +29,7 @@ def draw_regions(
     x: Float[np.ndarray, "times bodies n"],
     seen: Bool[np.ndarray, "times bodies"],
     bodies: Sequence[str],
-    marks: Marks,
+    marks: Marks | None = None,
 ) -> list[Path]:
     """`draw_observation` in the plane, `draw_in_space` in space."""
     return (draw_in_space if x.shape[-1] == 3 else draw_observation)(out, x, seen, bodies, marks)
@@ -40,7 +40,7 @@ def draw_in_space(
     x: Float[np.ndarray, "times bodies 3"],
     seen: Bool[np.ndarray, "times bodies"],
     bodies: Sequence[str],
-    marks: Marks,
+    marks: Marks | None = None,
 ) -> list[Path]:
     """Draw regions.png and regions.pdf from the files of the results folder and the positions of the log.
 
@@ -49,66 +49,57 @@ def draw_in_space(
         x: positions of the bodies [m].
         seen: where they were measured.
         bodies: names of the bodies.
-        marks: what is known besides. Only the truth is drawn.
+        marks: what is drawn besides.
 
     Raises:
         FigureError: a file is missing or damaged, or matplotlib fails.
         OSError: a figure cannot be written.
     """
-    final, history = _regions(out / "regions.json"), _history(out / "estimates.csv")
+    final, history = final_regions(out / "regions.json"), history_of(out / "estimates.csv")
+    marks, clock = marks or Marks(), Clock.of(float(next(iter(history.values()))["t"][0]))
 
     def draw(figure: Figure) -> None:
-        grid = figure.add_gridspec(2, 2)
-        axes = [figure.add_subplot(place) for place in (grid[1, 0], grid[0, 0], grid[0, 1])]
-        for plane, of in zip(PLANES, axes, strict=True):
-            draw_projection(of, plane, final, x, seen, bodies)
-            for robot, theta in marks.truth.items() if marks.is_place else ():
-                of.plot(*np.array(theta)[list(plane)], "*", color=colour(list(final).index(robot)), ms=11, mec="white")
-        draw_sizes(figure.add_subplot(grid[1, 1]), history, final)
+        grid = figure.add_gridspec(3, 2, height_ratios=(1, 1, 0.32))
+        maps = []
+        for plane, place in zip(PLANES, (grid[1, 0], grid[0, 0], grid[0, 1]), strict=True):
+            axes, of_plane = figure.add_subplot(place), seen_along(marks, plane)
+            unfinished = draw_map(axes, shadows(final, plane), x[..., plane], seen, bodies, of_plane)
+            axes.set(xlabel=f"{'xyz'[plane[0]]} [m]", ylabel=f"{'xyz'[plane[1]]} [m]")
+            axes.set_title(f"{axes.get_title(loc='left')}, along {'xyz'[3 - sum(plane)]}", pad=27)
+            maps.append((axes, unfinished, of_plane))
+        draw_sizes(figure.add_subplot(grid[1, 1]), history, final, clock, marks.unit)
+        draw_cases(figure.add_subplot(grid[2, :]), history, clock)
+        figure.draw_without_rendering()
+        if (layout := figure.get_layout_engine()) is not None:
+            layout.execute(figure)  # again, because an equal aspect changes limits and ticks
+        figure.set_layout_engine("none")  # labels are placed where the axes are now
+        for axes, unfinished, of_plane in maps:
+            finish_map(axes, unfinished, of_plane)
 
-    return render(out / "regions", (10.5, 8.4), draw)
+    return render(out / "regions", (10.5, 10.0), draw)
 
 
-def draw_projection(
-    axes: Axes,
-    plane: tuple[int, int],
-    final: Mapping[str, Any],
-    x: Float[np.ndarray, "times bodies 3"],
-    seen: Bool[np.ndarray, "times bodies"],
-    bodies: Sequence[str],
-) -> None:
-    """Paths and sets, seen along the third axis. Bodies that are not inferred are grey.
+def shadows(final: Mapping[str, Any], plane: tuple[int, int]) -> dict[str, Any]:
+    """The entries of regions.json, seen along the third axis. Sets over other parameters than places have no shadow."""
+    found = {}
+    for robot, region in final.items():
+        outline, centroid = np.empty((0, 2)), [None, None]
+        if len(region["centroid"]) == 3 and None not in region["centroid"]:
+            outline = shadow(np.array(region["vertices"], dtype=float)[:, plane])
+            centroid = [region["centroid"][i] for i in plane]
+        found[robot] = {**region, "vertices": outline, "centroid": centroid}
+    return found
 
-    Args:
-        axes: where it is drawn.
-        plane: the two axes that are seen.
-        final: for each robot its `vertices`, `centroid`, `diameter` and `status`.
-        x: positions of the bodies [m].
-        seen: where they were measured.
-        bodies: names of the bodies.
-    """
-    first, second = ("xyz"[i] for i in plane)
-    for k, body in enumerate(bodies):
-        path = thinned(x[seen[:, k], k])[:, plane]
-        if len(path) == 0:
-            continue
-        mine = colour(list(final).index(body)) if body in final else "0.7"
-        axes.plot(*path.T, color=mine, lw=1.2, alpha=0.8)
-        axes.plot(*path[0], "o", color=mine, ms=4, mfc="white")
-        axes.plot(*path[-1], "o", color=mine, ms=5 if body in final else 7)
-    for i, region in enumerate(final.values()):
-        if None in region["centroid"]:  # empty
-            continue
-        outline, is_ok = shadow(np.array(region["vertices"], dtype=float)[:, plane]), region["status"] == "ok"
-        looks = {"color": colour(i) if is_ok else "0.5", "alpha": 0.3 if is_ok else 0.15, "lw": 0}
-        axes.fill(*outline.T, **looks)
-        axes.plot(*np.vstack([outline, outline[:1]]).T, color=colour(i), lw=1.2, alpha=0.7, ls="-" if is_ok else "--")
-        axes.plot(*np.array(region["centroid"])[list(plane)], "+", color=colour(i), ms=11, mew=1.6)
-    axes.set(xlabel=f"{first} [m]", ylabel=f"{second} [m]", title=f"seen along {'xyz'[3 - sum(plane)]}")
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.margins(0.08)
-    axes.grid(color="0.93", lw=0.6)
-    axes.set_axisbelow(True)
+
+def seen_along(marks: Marks, plane: tuple[int, int]) -> Marks:
+    """The marks, seen along the third axis. Those over other parameters than places are left out."""
+
+    def projected(theta: Sequence[float]) -> list[float]:
+        return [theta[i] for i in plane]
+
+    prior = marks.prior if marks.prior is not None and len(marks.prior[0]) == 3 else None
+    truth = {robot: projected(theta) for robot, theta in marks.truth.items() if len(theta) == 3}
+    return replace(marks, prior=None if prior is None else (projected(prior[0]), projected(prior[1])), truth=truth)
 
 
 def shadow(points: Float[np.ndarray, "v 2"]) -> Float[np.ndarray, "k 2"]:
@@ -128,27 +119,3 @@ def shadow(points: Float[np.ndarray, "v 2"]) -> Float[np.ndarray, "k 2"]:
 def _turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> float:
     """Positive where the way from a over b to c turns left."""
     return float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
-
-
-def draw_sizes(axes: Axes, history: Mapping[str, Mapping[str, np.ndarray]], final: Mapping[str, Any]) -> None:
-    """The diameters over time, and in the legend the last ones.
-
-    Args:
-        axes: where they are drawn.
-        history: for each robot its times `t` [s] and `diameter` [m].
-        final: for each robot its `diameter` and `status`.
-    """
-    named = len(history) <= MOST_NAMED
-    for i, (robot, of) in enumerate(history.items()):
-        last, status = final[robot]["diameter"], final[robot]["status"]
-        told = "empty" if last is None or math.isnan(last) else f"{last:.2g} m"
-        label = f"{plain_name(robot)}: {told}" + ("" if status == "ok" else f", {status}")
-        axes.plot(thinned(of["t"]), thinned(of["diameter"]), color=colour(i), lw=1.5, label=label if named else None)
-    sizes = np.concatenate([of["diameter"] for of in history.values()])
-    sizes = sizes[sizes > 0]
-    if len(sizes) and sizes.max() > 2 * sizes.min():
-        axes.set_yscale("log")
-    axes.set(xlabel="t [s]", ylabel="diameter [m]", title="Size of the sets")
-    axes.grid(color="0.93", lw=0.6)
-    if named:
-        axes.legend(title="robot and last diameter", fontsize=8, ncols=1 + len(history) // 9)

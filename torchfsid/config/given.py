@@ -67,6 +67,12 @@ class GivenTask(_Given, _Task):
         return len(self.object.parameter_names)
 
     @property
+    def dimensions(self) -> tuple[int, ...]:
+        """What the task says. An own task that says nothing may be of either."""
+        said = getattr(self.object, "dimension", None)
+        return (2, 3) if said is None else (said,)
+
+    @property
     def unit(self) -> str:
         """The unit of theta, as far as the names of its entries tell it."""
         return UNITS.get(self._what, "")
