@@ -288,6 +288,7 @@ class BufferedVoronoiConfig(_RobotsOwn):
         horizon: the time for which a velocity is kept [s].
         max_speed: the largest speed on every axis [m/s].
         sidestep: distance of a wall below which the firmware may turn the command [m]; 0 if it was switched off.
+        soft: the controller may violate the rows.
     """
 
     kind: Literal["buffered_voronoi"] = "buffered_voronoi"
