@@ -1,4 +1,7 @@
-"""python -m benchmarks {geometry, polyhedra, layers, fleet, observer, gradients, safety, orca, threads} [options]"""
+"""python -m benchmarks NAME [options]
+
+NAME: geometry, polyhedra, layers, fleet, observer, gradients, safety, orca, threads or observe.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import os
 import sys
 from importlib import import_module
 
-NAMES = ("geometry", "polyhedra", "layers", "fleet", "observer", "gradients", "safety", "orca", "threads")
+NAMES = ("geometry", "polyhedra", "layers", "fleet", "observer", "gradients", "safety", "orca", "threads", "observe")
 
 
 def main(arguments: list[str]) -> int:

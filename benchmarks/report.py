@@ -201,6 +201,23 @@ def gradients(found: dict[str, Any]) -> str:
     return "\n".join(parts)
 
 
+def observe(found: dict[str, Any]) -> str:
+    parts = [
+        "## observe: a long log\n",
+        f"`torchfsid observe` on a CSV file of {found['robots']} robots and {found['samples']} samples: µs of CPU per",
+        "sample (all robots). In blocks is what the command does. Sample by sample, with filterpy, is a stream's cost,",
+        f"measured on {found['short']} samples. Largest memory: {found['memory_mb']} MB.\n",
+    ]
+    rows = []
+    for name in ("without the filter", "with the filter"):
+        by_sample = found[name]["sample by sample"]["observe"]
+        for path, spent in found[name].items():
+            stages = [number(spent[stage]) for stage in ("read", "observe", "draw")]
+            rows.append([f"{name}, {path}", *stages, number(by_sample / spent["observe"])])
+    parts.append(table(["", "read the file", "observe, write results", "figures", "×"], rows))
+    return "\n".join(parts)
+
+
 def page() -> str:
     parts = [HEAD]
     for name, part in (
@@ -208,6 +225,7 @@ def page() -> str:
         ("polyhedra", polyhedra),
         ("fleet", fleet),
         ("observer", observer),
+        ("observe", observe),
         ("layers", layers),
         ("gradients", gradients),
     ):

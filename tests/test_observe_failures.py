@@ -5,7 +5,7 @@ import errno
 import json
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -17,7 +17,7 @@ from tests.logs import write_config, write_log
 from torchfsid.cli import main
 from torchfsid.commands import results
 from torchfsid.commands.results_folder import ResultsFolder
-from torchfsid.observers.set_membership import SetEstimate, SetMembershipObserver
+from torchfsid.observers.set_membership import SetEstimates, SetMembershipObserver
 from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement
@@ -103,23 +103,24 @@ def test_a_signal_leaves_whole_samples_and_the_sets_so_far(
     observe: Observe, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
     """A second one while the sets are written changes nothing."""
-    update, regions, seen = SetMembershipObserver.update, results.regions, []
+    read, regions, seen = SetMembershipObserver.read, results.regions, []
 
-    def interrupted(self: SetMembershipObserver, measurement: Measurement) -> SetEstimate:
-        seen.append(measurement)
-        if len(seen) == 6:
+    def interrupted(self: SetMembershipObserver, samples: Measurement) -> Iterator[SetEstimates]:
+        seen.append(samples)
+        if len(seen) == 3:
             signal.raise_signal(number)
-        return update(self, measurement)
+        return read(self, samples)
 
     def asked_again(*arguments) -> dict:
         signal.raise_signal(signal.SIGINT)
         return regions(*arguments)
 
-    monkeypatch.setattr(SetMembershipObserver, "update", interrupted)
+    monkeypatch.setattr("torchfsid.commands.observe.BLOCK", 3)
+    monkeypatch.setattr(SetMembershipObserver, "read", interrupted)
     monkeypatch.setattr(results, "regions", asked_again)
     assert observe() == 128 + number
     assert last_line(capsys).endswith(f"; what is done so far is in {tmp_path / 'out'}")
-    assert len(rows_of(tmp_path / "out")) == 2 * 5
+    assert len(rows_of(tmp_path / "out")) == 2 * 6
     assert goals_are_inside(tmp_path / "out")
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         ".torchfsid",

@@ -155,8 +155,7 @@ class _Search:
     def __post_init__(self) -> None:
         self.whole = self.declared.consistency()
         self.limit = min(self.limit, self.whole.fastest)
-        self.part = copy(self.whole)
-        self.part.blocks = self.whole.blocks[:: math.ceil(len(self.whole.blocks) / MOST_BLOCKS)]
+        self.part = self.whole.thinned(MOST_BLOCKS)
 
     def improves(self, key: str, value: Any) -> bool:
         """Does a change need a smaller bound than those of its key before? It is then the limit."""

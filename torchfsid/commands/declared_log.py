@@ -23,7 +23,7 @@ from torchfsid.logs.commanded import Recovery, commanded
 from torchfsid.logs.contacts import arrival_errors
 from torchfsid.logs.gaps import bridged
 from torchfsid.logs.log import Log
-from torchfsid.observers.consistency import Consistency
+from torchfsid.observers.consistency import BLOCK, Consistency
 from torchfsid.robots.barriers import Barrier
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.tasks import Task
@@ -109,6 +109,10 @@ class DeclaredLog:
         self.task = config.task.build(self.log.bodies, self.log.x.shape[-1])
         self.barriers = config.build_barriers(self.log.bodies, self._radius)
         self.prior = config.prior.build(len(self.robots))
+        if config.ukf is not False:
+            updates = len(self.log.t) * len(self.robots)
+            chosen = config.ukf.for_log(updates, self.task.saturation is None)
+            self.config = self.config.model_copy(update={"ukf": chosen})
 
     def _require_accelerations(self) -> None:
         if self.log.u is None:
@@ -150,10 +154,14 @@ class DeclaredLog:
         rows = [barrier.labels(self.log.bodies) for barrier in self.barriers]
         return where_to_look(constraints, self.config, rows)
 
-    def measurements(self) -> Iterator[Measurement]:
-        """The samples of the robots, in the order of time."""
+    def measurements(self, block: int | None = None) -> Iterator[Measurement]:
+        """The samples of the robots, in the order of time.
+
+        Args:
+            block: how many are concatenated to one measurement. None: each measurement is one sample.
+        """
         uses, required = self.config.neighbour_velocities, self.config.required
-        return self.log.measurements(self.robots, uses, required, self._arrival_errors)
+        return self.log.measurements(self.robots, uses, required, self._arrival_errors, block)
 
     @property
     def contacts(self) -> int:
@@ -171,8 +179,7 @@ class DeclaredLog:
     def consistency(self) -> Consistency:
         """What the log says about the bound on controls, under the model and all other declared bounds."""
         noise = self.config.noise
-        samples = list(self.measurements())
-        return Consistency(samples, self.task, self.barriers, self.prior, noise.slack, noise.build_others())
+        return Consistency(_Blocks(self), self.task, self.barriers, self.prior, noise.slack, noise.build_others())
 
     def shifted(self, samples: int) -> DeclaredLog:
         """The same log with controls taken this number of samples later."""
@@ -252,6 +259,16 @@ class DeclaredLog:
         """
         consistency = self.consistency()
         return dict(zip(self.robots, consistency.smallest_bounds(consistency.fastest).tolist(), strict=True))
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """The samples of a log in blocks, made again whenever they are iterated over."""
+
+    declared: DeclaredLog
+
+    def __iter__(self) -> Iterator[Measurement]:
+        return self.declared.measurements(BLOCK)
 
 
 def automatic_bound(smallest: Mapping[str, float], quantity: str = "velocity") -> float:

@@ -7,10 +7,11 @@ is dotted from the first contradiction on.
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +51,8 @@ def draw_observation(
         FigureError: a file is missing or damaged, or matplotlib fails.
         OSError: a figure cannot be written.
     """
-    final, history = final_regions(out / "regions.json"), history_of(out / "estimates.csv")
+    final = final_regions(out / "regions.json")
+    history = history_of(out / "estimates.csv", final)
     marks, clock = marks or Marks(), Clock.of(float(next(iter(history.values()))["t"][0]))
     width, height = extent(final, x[..., :2], seen, marks)
     is_flat = width > FLAT * height
@@ -100,16 +102,23 @@ def final_regions(path: Path) -> dict[str, Any]:
         raise FigureError(f"{path}: missing or damaged: {one_line(error)}") from error
 
 
-def history_of(path: Path) -> dict[str, dict[str, np.ndarray]]:
-    """For each robot: times [s], diameters (NaN if the set is empty) and indices of cases (NaN if not measured)."""
+def history_of(path: Path, robots: Collection[str]) -> dict[str, dict[str, np.ndarray]]:
+    """For each robot: times [s], diameters (NaN if the set is empty) and indices of cases (NaN if not measured).
+
+    The times are thinned while they are read: what is not drawn is not parsed.
+    """
     columns: dict[str, tuple[list[float], list[float], list[float]]] = defaultdict(lambda: ([], [], []))
     number = {"": math.nan, **{case: float(i) for i, case in enumerate(CASES)}}
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.reader(file)
-            header = next(reader)
+            lines = sum(len(list(io.StringIO(f"{name}.", newline=""))) for name in robots)  # a name may have several
+            times = (sum(1 for _ in file) - 1) // max(1, lines)
+            file.seek(0)
+            header = next(csv.reader(file))
             robot, *wanted = (header.index(name) for name in ("robot", "t", "diameter", "case"))
-            for row in reader:
+            drawn = set(thinned(np.arange(times)).tolist())
+            kept = (line for k, line in enumerate(file) if k // max(1, lines) in drawn or k >= times * lines)
+            for row in csv.reader(kept):
                 t, diameter, case = (row[i] for i in wanted)
                 of_robot = columns[row[robot]]
                 of_robot[0].append(float(t))

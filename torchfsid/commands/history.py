@@ -15,14 +15,16 @@ active, joined by "; ".
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from torchfsid.commands.table_file import TableFile, number, texts
 from torchfsid.logs.log import Log
-from torchfsid.observers.set_membership import SetEstimate
+from torchfsid.observers.set_membership import SetEstimates
 from torchfsid.sets.feasible_set import FeasibleSet
 
 STEP = 0.05
@@ -48,13 +50,13 @@ class SetsFile(TableFile):
         self._written = [(math.nan, math.nan)] * len(robots)
         self._last_t = math.nan
 
-    def see(self, t: float, sets: FeasibleSet, sizes: Sequence[tuple[float, float]]) -> None:
+    def see(self, t: float, sizes: Sequence[tuple[float, float]], sets: Callable[[], FeasibleSet]) -> None:
         """Take in the sets at a time [s], with the volume and diameter of each (NaN if it is empty)."""
         changed = [i for i, size in enumerate(sizes) if _differ(size, self._written[i])]
         for i in changed:
             self._written[i] = sizes[i]
         if changed:
-            self._write(t, sets, changed)
+            self._write(t, sets(), changed)
         self._last_t = t
 
     def finish(self, sets: FeasibleSet) -> None:
@@ -92,28 +94,30 @@ class MotionFile(TableFile):
         self._place = {robot: i for i, robot in enumerate(robots)}
         self._stride, self._sample = max(1, math.ceil((len(log.t) - 1) / (MOST_TIMES - 1))), 0
 
-    def see(self, estimate: SetEstimate) -> None:
-        """Take in the next sample of the log."""
-        log, k = self._log, self._sample
-        self._sample += 1
-        if k % self._stride and k < len(log.t) - 1:
-            return
-        unknown, lines = [""] * log.x.shape[-1], []
+    def see(self, estimates: SetEstimates) -> None:
+        """Take in the next samples of the log."""
+        first, self._sample = self._sample, self._sample + len(estimates)
+        last = len(self._log.t) - 1
+        kept = [k for k in range(first, self._sample) if k % self._stride == 0 or k == last]
+        self.write(
+            [line for k in kept for line in self._lines(k, estimates.kkt.active, (k - first) * len(self._place))]
+        )
+
+    def _lines(self, k: int, active: Bool[Tensor, "items m"], place: int) -> Iterator[list[str]]:
+        """The lines of sample k, whose robots come from `place` on in `active`."""
+        log, unknown = self._log, [""] * self._log.x.shape[-1]
         for j, body in enumerate(log.bodies):
             if not log.seen[k, j]:
                 continue
             known = log.u is not None and log.velocity_known[k, j]
             velocity = [number(v) for v in log.u[k, j]] if known and log.u is not None else unknown
             position = [number(x) for x in log.x[k, j]]
+            rows: list[int] = []
+            if body in self._place:
+                rows = active[place + self._place[body]].nonzero().flatten().tolist()
+            names = "; ".join([self._labels[row] for row in rows])
             radius = [] if log.radius is None else [number(float(log.radius[j]))]
-            lines.append([number(log.t[k]), body, *position, *velocity, *radius, self._active(estimate, body)])
-        self.write(lines)
-
-    def _active(self, estimate: SetEstimate, body: str) -> str:
-        if body not in self._place:
-            return ""
-        active = estimate.kkt.active[self._place[body]].nonzero().flatten().tolist()
-        return "; ".join(self._labels[int(row)] for row in active)
+            yield [number(log.t[k]), body, *position, *velocity, *radius, names]
 
 
 def _differ(size: tuple[float, float], written: tuple[float, float]) -> bool:

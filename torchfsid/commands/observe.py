@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -25,18 +26,36 @@ from torchfsid.config.observe import ObserveConfig
 from torchfsid.errors import FsidError, InconsistentError
 from torchfsid.identification.kkt import CASES
 from torchfsid.logs.log import Log
-from torchfsid.observers.hybrid import HybridObserver
+from torchfsid.observers.hybrid import HybridEstimates, HybridObserver
 from torchfsid.observers.outliers import SetAside
 from torchfsid.observers.safety import SafetyObserver, SetObserver
-from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.observers.set_membership import SetEstimates, SetMembershipObserver
 from torchfsid.outcome import Status
 from torchfsid.robots.measurement import Measurement
 
 HARDLY_CUT = 0.5
 """Share of its prior beyond which a set says little."""
 
-Track = Callable[[Iterable[Measurement]], Iterable[Measurement]]
-"""Passes measurements on, and shows how far they have come."""
+BLOCK = 512
+"""Samples that are read at once, at most."""
+
+BLOCK_ROWS = 200_000
+"""Rows of barriers that are read at once, about: what all robots see of all bodies. It bounds memory."""
+
+BLOCK_UPDATES = 2000
+"""Updates of filterpy's filters for each block: about a second's, since results are written block by block."""
+
+Estimated = tuple[Measurement, SetEstimates | HybridEstimates]
+"""Samples, and the estimates after each of them."""
+
+
+def times_in(item: Estimated) -> int:
+    """The number of samples."""
+    return len(item[1])
+
+
+Track = Callable[[Iterable[Estimated]], Iterable[Estimated]]
+"""Passes estimates on, and shows how far they have come."""
 
 
 @dataclass(frozen=True)
@@ -218,20 +237,19 @@ class Observation:
             closing(MotionFile(out / "motion.csv", self.log, self.robots, labels)) as motion,
             nullcontext() if mcap is None else RunInMcap(mcap, self.declared, results.header, bag) as viewed,
         ):
-            for measurement in track(self.declared.measurements()):
-                try:
-                    estimate = self.observer.update(measurement)
-                except InconsistentError as error:
-                    raise FsidError(self._named(error)) from error
-                lines = results.write(measurement, estimate)
-                sets = of_sets(estimate)
+            for samples, estimates in track(self._estimates()):
+                lines = results.write(samples, estimates)
+                sets = of_sets(estimates)
                 motion.see(sets)
                 if viewed is not None:
-                    viewed.see(float(sets.t), sets.feasible_set, sets.status.tolist(), lines)
-                for robot, case, used in zip(
-                    self.robots, sets.kkt.case.tolist(), sets.informative.tolist(), strict=True
-                ):
-                    self._cases[robot].update([CASES[case]] if used else [])
+                    cells, robots = list(csv.reader(lines)), len(self.robots)
+                    for s, t in enumerate(sets.t.tolist()):
+                        shown = sets.sets.select(sets.which[s])
+                        viewed.see(t, shown, sets.status[s].tolist(), cells[s * robots : (s + 1) * robots])
+                cases = sets.kkt.case.view(sets.which.shape)
+                for i, robot in enumerate(self.robots):
+                    counts = cases[:, i][sets.informative[:, i]].bincount(minlength=len(CASES)).tolist()
+                    self._cases[robot].update(dict(zip(CASES, counts, strict=True)))
             if isinstance(self.sets, SafetyObserver):
                 try:
                     self.sets.look_again(list(self.declared.measurements()))
@@ -239,6 +257,23 @@ class Observation:
                     raise FsidError(self._named(error)) from error
             if viewed is not None:
                 viewed.finish(self.sets.feasible_set, self.sets.status.tolist())
+
+    def _estimates(self) -> Iterator[Estimated]:
+        """The samples in blocks, with their estimates."""
+        robots = len(self.robots)
+        rows = robots * len(self.log.bodies)
+        block = min(BLOCK, BLOCK_ROWS // rows)
+        if isinstance(self.observer, HybridObserver) and self.observer.ukf.engine == "filterpy":
+            block = min(block, BLOCK_UPDATES // robots)
+        for samples in self.declared.measurements(max(1, block)):
+            first = 0
+            try:
+                for estimates in self.observer.read(samples):
+                    last = first + len(estimates) * robots
+                    yield samples.select(slice(first, last)), estimates
+                    first = last
+            except InconsistentError as error:
+                raise FsidError(self._named(error)) from error
 
     def _named(self, error: InconsistentError) -> str:
         """The error with the names of robot and rows."""

@@ -14,7 +14,7 @@ from torchfsid.commands.command_line import use_one_thread
 from torchfsid.commands.declared_log import AUTO_FACTOR, DeclaredLog
 from torchfsid.commands.hypotheses import Hypotheses
 from torchfsid.commands.map_panel import Marks
-from torchfsid.commands.observe import Observation
+from torchfsid.commands.observe import Observation, times_in
 from torchfsid.commands.page.report import write_pages
 from torchfsid.commands.page.write import PAGE
 from torchfsid.commands.provenance import made_from
@@ -96,7 +96,8 @@ def observe_log(
                 write_json(out / "unknown_numbers.json", observation.narrowing.to_json())
                 if "task.gain" in observation.narrowing.numbers:
                     write_json(out / "task_gain.json", observation.narrowing.numbers["task.gain"].to_json())
-            shown = partial(track, what=f"Observing {name}".strip(), total=observation.samples)
+            what, total = f"Observing {name}".strip(), observation.samples
+            shown = partial(track, what=what, total=total, size=times_in)
             observation.run(out, shown, source, mcap, path if merge else None)
             with status("Drawing"):
                 seen = observation.log

@@ -26,28 +26,34 @@ Further sets follow with their name as prefix. Sizes and centres of an empty set
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType, TracebackType
+from typing import NamedTuple
 
 import torch
+from jaxtyping import Float, Int
+from torch import Tensor
 
 from torchfsid.commands.history import SetsFile
 from torchfsid.commands.interruption import uninterrupted
 from torchfsid.commands.results_folder import write_json
 from torchfsid.commands.safety_results import COLUMNS, Distances, SafetyColumns, refutation, safety, without_repeats
-from torchfsid.commands.table_file import TableFile, number, texts
+from torchfsid.commands.table_file import TableFile, line_of, lines_of, number
 from torchfsid.commands.where_to_look import constraint_name
+from torchfsid.halfspaces import array
 from torchfsid.identification.kkt import CASES
-from torchfsid.observers.hybrid import HybridEstimate
+from torchfsid.observers.hybrid import HybridEstimate, HybridEstimates
 from torchfsid.observers.safety import SafetyObserver, SetObserver
-from torchfsid.observers.set_membership import SetEstimate, SetMembershipObserver
+from torchfsid.observers.set_membership import SetEstimate, SetEstimates, SetMembershipObserver
 from torchfsid.outcome import Status
 from torchfsid.robots.measurement import Measurement
 from torchfsid.sets.feasible_set import FeasibleSet
 
 STATUS_NAMES = {Status.OK: "ok", Status.ALARM: "alarm", Status.INCONSISTENT: "inconsistent"}
+
+Estimate = SetEstimate | SetEstimates | HybridEstimate | HybridEstimates
 
 
 class ResultsWriter:
@@ -85,6 +91,7 @@ class ResultsWriter:
     ):
         self.out, self.robots, self.observer, self.others = out, list(robots), observer, others
         self._labels, self._seen, self._truth = labels, Distances(), truth
+        self._names = [line_of([robot]) for robot in self.robots]
         told = (("bound", bound), ("log", log), ("made_from", made_from))
         self._told = {name: dict(content) for name, content in told if content}
         self._safety = SafetyColumns(observer) if isinstance(observer, SafetyObserver) else None
@@ -129,39 +136,51 @@ class ResultsWriter:
     def write(
         self,
         measurement: Measurement,
-        estimate: HybridEstimate | SetEstimate,
+        estimate: Estimate,
         others: Mapping[str, SetEstimate] = MappingProxyType({}),
-    ) -> list[list[str]]:
-        """Write one line per robot for the time of `estimate`, and return these lines of estimates.csv."""
-        sets, blank = of_sets(estimate), [[""] * self.observer.feasible_set.dim] * len(self.robots)
-        ukf, hybrid = blank, blank
-        if isinstance(estimate, HybridEstimate):
-            ukf, hybrid = texts(estimate.ukf_estimate.theta), texts(estimate.theta)
+    ) -> list[str]:
+        """Write one line per robot for the time of the estimate, or for each time of several.
+
+        Returns these lines of estimates.csv.
+        """
+        sets = of_sets(estimate)
+        samples, robots = sets.which.shape
+        items, p = samples * robots, self.observer.feasible_set.dim
+        ukf = hybrid = ["," * (p - 1)] * items
+        if isinstance(estimate, HybridEstimate | HybridEstimates):
+            filtered = estimate.ukf_estimate if isinstance(estimate, HybridEstimate) else estimate.ukf_estimates
+            ukf, hybrid = lines_of(filtered.theta.flatten(0, -2)), lines_of(estimate.theta.flatten(0, -2))
         observed = measurement.observed
-        measured = [True] * len(self.robots) if observed is None else observed.tolist()
-        case, n_active, status = sets.kkt.case.tolist(), sets.kkt.n_active.tolist(), sets.status.tolist()
-        described, t = self._described[""](sets.feasible_set), number(float(estimate.t))
-        learned: Sequence[Sequence[str]] = [[]] * len(self.robots)
+        measured = [True] * items if observed is None else array(observed).tolist()
+        cases = zip(*(array(of).tolist() for of in (sets.kkt.case, sets.kkt.n_active)), measured, strict=True)
+        active = [f"{CASES[case]},{n}" if seen else "," for case, n, seen in cases]
+        described = self._described[""](sets)
+        names = [STATUS_NAMES[status] for status in array(sets.status.flatten()).tolist()]
         if self._safety is not None and sets.safety is not None:
             self._seen.see(measurement)
-            learned = self._safety(sets.safety)
-        extra = [(self._described[name](other.feasible_set), other.status.tolist()) for name, other in others.items()]
-        rows = []
-        for i, robot in enumerate(self.robots):
-            active = [CASES[case[i]], str(n_active[i])] if measured[i] else ["", ""]
-            row = [t, robot, *active, *described[i], *ukf[i], *hybrid[i], *learned[i], STATUS_NAMES[status[i]]]
-            for columns, other_status in extra:
-                row += [*columns[i], STATUS_NAMES[other_status[i]]]
-            rows.append(row)
-        self._estimates.write(rows)
-        sizes = [(_value(volume), _value(diameter)) for volume, diameter, *_ in described]
-        self._sets.see(float(estimate.t), sets.feasible_set, sizes)
-        return rows
+            names = [line_of([*cells, name]) for cells, name in zip(self._safety(sets.safety), names, strict=True)]
+        for prefix, other in others.items():
+            of_other = zip(names, self._described[prefix](of_sets(other)), other.status.tolist(), strict=True)
+            names = [f"{name},{cells.text},{STATUS_NAMES[status]}" for name, cells, status in of_other]
+        heads = [f"{t},{name}" for t in map(number, sets.t.tolist()) for name in self._names]
+        places = (described[place].text for place in array(sets.which.flatten()).tolist())
+        rows = zip(heads, active, places, ukf, hybrid, names, strict=True)
+        lines = [",".join(row) + "\r\n" for row in rows]
+        self._estimates.write_texts("".join(lines[k : k + robots]) for k in range(0, items, robots))
+        for s in sorted({0, *_changes(sets.which), samples - 1}):
+            at = sets.which[s]
+            self._sets.see(
+                float(sets.t[s]), [described[place][:2] for place in at.tolist()], partial(sets.sets.select, at)
+            )
+        return lines
 
 
-def of_sets(estimate: HybridEstimate | SetEstimate) -> SetEstimate:
-    """The estimate of the sets alone."""
-    return estimate.set_estimate if isinstance(estimate, HybridEstimate) else estimate
+def of_sets(estimate: Estimate) -> SetEstimates:
+    """The estimates of the sets alone."""
+    if isinstance(estimate, HybridEstimates):
+        return estimate.set_estimates
+    found = estimate.set_estimate if isinstance(estimate, HybridEstimate) else estimate
+    return found if isinstance(found, SetEstimates) else SetEstimates.of(found)
 
 
 def holds(sets: FeasibleSet, i: int, theta: Sequence[float]) -> bool:
@@ -174,29 +193,46 @@ def set_columns(p: int) -> list[str]:
     return ["volume", "diameter", *_indexed("centre", p), "radius", *_indexed("centroid", p)]
 
 
-def describe(sets: FeasibleSet) -> list[list[str]]:
-    """Volume, diameter, Chebyshev centre and radius, centroid of each set, as text. Empty where a value is NaN."""
+def describe(sets: FeasibleSet) -> Float[Tensor, "B columns"]:
+    """Volume, diameter, Chebyshev centre and radius, centroid of each set."""
     centre, radius = sets.chebyshev()
-    columns = [sets.volume()[:, None], sets.diameter()[:, None], centre, radius[:, None], sets.centroid()]
-    return texts(torch.cat(columns, dim=-1))
+    return torch.cat([sets.volume()[:, None], sets.diameter()[:, None], centre, radius[:, None], sets.centroid()], -1)
+
+
+class _Description(NamedTuple):
+    """A set in numbers: its size, and the text of all of `describe`."""
+
+    volume: float
+    diameter: float
+    text: str
 
 
 class _Descriptions:
-    """`describe` for one sample after another. Only sets that have changed are measured again."""
+    """Descriptions of estimates, one after the other. Only sets that have changed are measured again."""
 
     def __init__(self) -> None:
-        self._texts: list[list[str]] = []
+        self._known: list[_Description] = []
         self._last_cut = torch.empty(0)
 
-    def __call__(self, sets: FeasibleSet) -> list[list[str]]:
-        last_cut = sets.last_cut.nan_to_num(nan=-math.inf)  # a set that is reset is the prior, which was never cut
-        if not self._texts:
-            self._texts = describe(sets)
-        elif len(changed := (last_cut != self._last_cut).nonzero().flatten()):
-            for i, texts in zip(changed.tolist(), describe(sets.select(changed)), strict=True):
-                self._texts[i] = texts
-        self._last_cut = last_cut
-        return self._texts
+    def __call__(self, estimates: SetEstimates) -> list[_Description]:
+        """The descriptions of `estimates.sets`, of which the first ones are those of all robots."""
+        last_cut = estimates.sets.last_cut.nan_to_num(nan=-math.inf)  # of a set that was reset: never cut
+        new, robots = torch.ones_like(last_cut, dtype=torch.bool), len(self._last_cut)
+        new[:robots] = last_cut[:robots] != self._last_cut
+        fresh: Iterator[_Description] = iter(())
+        if bool(new.any()):
+            values = describe(estimates.sets.select(new))
+            columns = values[:, 0].tolist(), values[:, 1].tolist(), lines_of(values)
+            fresh = map(_Description, *columns)
+        found = [next(fresh) if is_new else self._known[k] for k, is_new in enumerate(new.tolist())]
+        final = estimates.which[-1]
+        self._known, self._last_cut = [found[place] for place in final.tolist()], last_cut[final]
+        return found
+
+
+def _changes(which: Int[Tensor, "S B"]) -> list[int]:
+    """The samples at which some robot's set is another one than before."""
+    return (1 + (which[1:] != which[:-1]).any(-1).nonzero().flatten()).tolist()
 
 
 def regions(
@@ -277,7 +313,3 @@ def regions(
 
 def _indexed(name: str, p: int) -> list[str]:
     return [f"{name}_{i}" for i in range(p)]
-
-
-def _value(text: str) -> float:
-    return float(text) if text else math.nan

@@ -55,7 +55,8 @@ def draw_in_space(
         FigureError: a file is missing or damaged, or matplotlib fails.
         OSError: a figure cannot be written.
     """
-    final, history = final_regions(out / "regions.json"), history_of(out / "estimates.csv")
+    final = final_regions(out / "regions.json")
+    history = history_of(out / "estimates.csv", final)
     marks, clock = marks or Marks(), Clock.of(float(next(iter(history.values()))["t"][0]))
 
     def draw(figure: Figure) -> None:

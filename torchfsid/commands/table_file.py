@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import accumulate
 from pathlib import Path
 
 from torch import Tensor
@@ -37,17 +38,24 @@ class TableFile:
 
     def write(self, lines: Sequence[Sequence[str]]) -> None:
         """Write all lines or none, even if writing fails or is interrupted."""
-        if self.problem is not None:
-            return
         text = io.StringIO(newline="")
         csv.writer(text).writerows(lines)
-        content, whole = text.getvalue().encode(), self._file.tell()
+        self.write_texts([text.getvalue()])
+
+    def write_texts(self, texts: Iterable[str]) -> None:
+        """Write texts of whole lines (`line_of`). If writing fails or is interrupted, each is there wholly or not."""
+        if self.problem is not None:
+            return
+        contents = [text.encode() for text in texts]
+        content, start = b"".join(contents), self._file.tell()
         try:
             with named(self.path):
                 while content:
                     content = content[self._file.write(content) :]
         except BaseException as error:
-            self._file.truncate(whole)
+            ends = accumulate(map(len, contents), initial=start)
+            written = self._file.tell()
+            self._file.truncate(max(end for end in ends if end <= written))
             if not isinstance(error, OSError):
                 raise
             self.problem = error
@@ -69,6 +77,21 @@ def number(value: float) -> str:
     With 12 digits map coordinates would end at hundredths of a millimetre.
     """
     return f"{value:.15g}" if math.isfinite(value) else ""
+
+
+def line_of(cells: Sequence[str]) -> str:
+    """The cells as a part of a line."""
+    text = io.StringIO(newline="")
+    csv.writer(text, lineterminator="").writerow(cells)
+    return text.getvalue()
+
+
+def lines_of(values: Tensor) -> list[str]:
+    """The numbers (rows, columns) as text, each row as a part of a line."""
+    if not bool(values.isfinite().all()):
+        return [",".join(row) for row in texts(values)]
+    form = ",".join(["%.15g"] * values.shape[-1])
+    return [form % tuple(row) for row in values.numpy(force=True).tolist()]  # torch's own tolist is ten times slower
 
 
 def texts(values: Tensor) -> list[list[str]]:

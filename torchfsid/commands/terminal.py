@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import IO, Any, TypeVar, cast
 
 from rich.console import Console
@@ -73,7 +73,9 @@ def table(title: str, texts: Sequence[str], numbers: Sequence[str] = ()) -> Tabl
     return made
 
 
-def track(items: Iterable[Item], what: str, total: int, finished: int = 0) -> Iterator[Item]:
+def track(
+    items: Iterable[Item], what: str, total: int, finished: int = 0, size: Callable[[Item], int] = lambda _: 1
+) -> Iterator[Item]:
     """Pass items on and show progress.
 
     Args:
@@ -81,6 +83,7 @@ def track(items: Iterable[Item], what: str, total: int, finished: int = 0) -> It
         what: what is done with them, for the progress line.
         total: number of all items, the `finished` ones included.
         finished: number of items that were done before.
+        size: how many an item counts for.
     """
     shown = aside()
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
@@ -88,7 +91,7 @@ def track(items: Iterable[Item], what: str, total: int, finished: int = 0) -> It
         task = progress.add_task(_first(what, shown), total=total, completed=finished)
         for item in items:
             yield item
-            progress.update(task, advance=1, description=what)
+            progress.update(task, advance=size(item), description=what)
         if progress.tasks[0].completed > finished:
             _kernels_are_compiled()
 

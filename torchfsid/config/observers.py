@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from torchfsid.sets.feasible_set import FeasibleSet
 
 
+LONG_LOG = 2000
+"""Updates of filters, one per robot and sample, beyond which a log takes the compiled filter: about a second's."""
+
 FARTHEST = 1e9
 """The furthest that a prior may reach, in the units of theta. Doubles have 16 digits: from here, sets keep 1e-7."""
 
@@ -191,6 +194,8 @@ class UkfConfig(Strict):
         prior_std: standard deviation of theta at the start. Default: that of a uniform distribution over the prior.
         qp_inside: solve the QP inside the filter's dynamics. Otherwise the measurement determines the active rows.
         feedback: the filter goes on from the hybrid observer's projected estimate instead of its own.
+        engine: `filterpy`, or `batch`: the same filter in compiled code. Default: `filterpy`, and `batch` for logs of
+            more than `LONG_LOG` updates where it can be used (`for_log`).
     """
 
     position_noise: Positive = 1e-3
@@ -198,6 +203,24 @@ class UkfConfig(Strict):
     prior_std: Positive | None = None
     qp_inside: Flag = False
     feedback: Flag = False
+    engine: Literal["filterpy", "batch"] | None = None
+
+    def for_log(self, updates: int, is_linear: bool) -> UkfConfig:
+        """The configuration with an engine.
+
+        Args:
+            updates: the number of samples times that of robots.
+            is_linear: whether nominal controls are not clipped.
+
+        Raises:
+            ConfigError: the declared engine cannot be used.
+        """
+        linear = is_linear and not self.qp_inside
+        if self.engine == "batch" and not linear:
+            reason = "the QP is inside" if self.qp_inside else "nominal controls are clipped"
+            raise ConfigError(f"ukf.engine: 'batch' needs a linear model, but {reason} (use 'filterpy')")
+        engine = self.engine or ("batch" if linear and updates > LONG_LOG else "filterpy")
+        return self.model_copy(update={"engine": engine})
 
     def spread(self, prior: PriorConfig) -> tuple[float, ...]:
         """Standard deviations of theta at the start, one per entry of theta."""
@@ -228,4 +251,5 @@ class UkfConfig(Strict):
             process_noise=self.process_noise,
             active_tolerance=active_tolerance,
             qp_inside=self.qp_inside,
+            engine=self.engine or "filterpy",
         )

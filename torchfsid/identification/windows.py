@@ -32,9 +32,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchfsid.errors import InputError
-from torchfsid.halfspaces import Halfspaces
+from torchfsid.halfspaces import Halfspaces, array
 from torchfsid.identification.by_robot import by_robot
 from torchfsid.identification.evidence import Evidence, ObservationModel, Sample, read_sample, sample_of
+from torchfsid.kernels.directions import extreme_directions
 from torchfsid.robots.bounds import RowErrors
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.tasks import Saturation
@@ -77,12 +78,15 @@ class _Moments:
     d: Float[Tensor, "S B 2"]
     drift: Float[Tensor, "S B"]
 
-    def followed_by(self, last: _Moments, since: float) -> _Moments:
-        """These samples from the time `since` on, and another one."""
-        kept = int((self.t >= since).sum())
+    def followed_by(self, others: _Moments) -> _Moments:
+        """These samples and others."""
         names = [field.name for field in fields(self)]
-        first = len(self.t) - kept
-        return _Moments(**{name: torch.cat([getattr(self, name)[first:], getattr(last, name)]) for name in names})
+        return _Moments(**{name: torch.cat([getattr(self, name), getattr(others, name)]) for name in names})
+
+    def since(self, t: Tensor) -> _Moments:
+        """The samples from the time t on."""
+        first = int((self.t < t).sum())
+        return _Moments(*(getattr(self, field.name)[first:] for field in fields(self)))
 
 
 @dataclass
@@ -113,7 +117,7 @@ class Windows:
         self.used = self.ended = torch.zeros(len(self.lengths), dtype=torch.long)
 
     def read(self, theta: FeasibleSet, measurement: Measurement, compiled: bool | None = None) -> Evidence:
-        """The evidence of a sample and of the windows that end at it.
+        """The evidence of a sample and of the windows that end at it, or of several samples concatenated.
 
         Args:
             theta: the robots' sets so far, batch (B,).
@@ -124,102 +128,117 @@ class Windows:
         Raises:
             InputError: see `evidence`. The positions are not planar, or times do not increase.
         """
-        measurement = measurement.observed_only()
+        measurement, robots = measurement.observed_only(), theta.batch_shape.numel()
         if measurement.x.shape[-1] != 2:
             raise InputError("measurement", "planar positions, for windows", tuple(measurement.x.shape))
         sample = sample_of(self.model, theta, measurement)
         found = read_sample(self.model, sample, compiled)
-        now, before = self._moment(measurement, sample, found), self._moments
-        if before is None:
-            self._moments = now
-            return found
-        t = measurement.time
-        if not t > float(before.t[-1]):
-            raise InputError("measurement.t", f"a time after {float(before.t[-1])}", t)
-        self._moments = before.followed_by(now, t - max(self.lengths) * (1 + TIME_ROUND_OFF))
-        windows, whole = self._windows(before, now, theta, sample)
+        moments, new = self._moments_of(measurement, sample, found, robots), len(found.informative) // max(robots, 1)
+        if self._moments is not None:
+            moments = self._moments.followed_by(moments)
+        late = ~(moments.t.diff() > 0)
+        if bool(late.any()):
+            t = moments.t[:-1][late][0]
+            raise InputError("measurement.t", f"a time after {float(t)}", float(moments.t[1:][late][0]))
+        self._moments = moments.since(moments.t[-1] - max(self.lengths) * (1 + TIME_ROUND_OFF))
+        windows, whole = self._windows(moments, new, theta, sample)
         if not bool(whole.any()):
             return found
         of_windows = read_sample(self.model, windows, compiled)
         says = of_windows.informative.unflatten(0, (len(self.lengths), -1))
-        self.used, self.ended = self.used + says.sum(1), self.ended + whole.sum(1)
-        omega, _ = by_robot(of_windows.omega, t, len(measurement.x))
+        self.used, self.ended = self.used + says.sum(1), self.ended + whole.flatten(1).sum(1)
+        omega, _ = by_robot(of_windows.omega, 0.0, len(measurement.x))
         return replace(found, omega=Halfspaces.stack([found.omega, omega]), informative=found.informative | says.any(0))
 
-    def _moment(self, measurement: Measurement, sample: Sample, found: Evidence) -> _Moments:
+    def _moments_of(self, measurement: Measurement, sample: Sample, found: Evidence, robots: int) -> _Moments:
         noise, errors, A, observed = self.model.noise, sample.row_errors, sample.rows.A, measurement.observed
         assert noise is not None
         rho = torch.full_like(sample.u[:, 0], noise.position)
         if measurement.position_error is not None:
             rho = rho + measurement.position_error
-        of_robots = (
+        of_items = (
             measurement.x, rho, torch.ones_like(found.informative) if observed is None else observed,
             found.informative, torch.atan2(A[..., 1], A[..., 0]),
             torch.zeros_like(sample.rows.b) if errors is None else errors.angle,
             (2 * found.slack + found.excess <= 0) & (A != 0).any(-1),  # slack <= room = -excess - slack
             sample.C, sample.d, sample.drift.expand(len(rho)),
         )  # fmt: skip
-        return _Moments(measurement.x.new_tensor([measurement.time]), *(value.unsqueeze(0) for value in of_robots))
+        t = torch.as_tensor(measurement.t, dtype=torch.float64, device=rho.device).expand(len(rho))[:: max(robots, 1)]
+        return _Moments(t.contiguous(), *(value.unflatten(0, (-1, robots)) for value in of_items))
 
     def _windows(
-        self, before: _Moments, now: _Moments, theta: FeasibleSet, sample: Sample
-    ) -> tuple[Sample, Bool[Tensor, "L B"]]:
-        """The L windows of each robot as L*B samples, whose rows are fans, and which of them have no gap."""
-        L, B, t, saturation = len(self.lengths), now.x.shape[1], now.t, self.model.task.saturation
-        length = before.t.new_tensor(self.lengths)
-        inside = before.t >= (t - length * (1 + TIME_ROUND_OFF)).unsqueeze(-1)
-        count = inside.sum(-1)
-        first = (len(before.t) - count).clamp(max=len(before.t) - 1)
-        T = t - before.t[first]
-        reached = (count > 0) & (length * (1 - 0.5 / count.clamp(min=1)) <= T)
-        weight = inside * torch.cat([before.t, t]).diff() / T.unsqueeze(-1)
+        self, series: _Moments, new: int, theta: FeasibleSet, sample: Sample
+    ) -> tuple[Sample, Bool[Tensor, "L S B"]]:
+        """The L windows of each robot that end at the last S samples, as L*S*B samples whose rows are fans.
+
+        Also returns which of them have no gap.
+        """
+        N, device, saturation = len(series.t), series.t.device, self.model.task.saturation
+        length, last = series.t.new_tensor(self.lengths), torch.arange(N - new, N, device=device)
+        t = series.t[last]
+        # Of N samples, those from `first` on are inside, and the last one ends the window.
+        first = torch.searchsorted(series.t, t - (length * (1 + TIME_ROUND_OFF)).unsqueeze(-1))
+        count = last - first
+        reached = length.unsqueeze(-1) * (1 - 0.5 / count.clamp(min=1)) <= t - series.t[first]
+        T = torch.where(reached, t - series.t[first], 1.0)
+        place = torch.arange(N, device=device)
+        inside = (place >= first.unsqueeze(-1)) & (place < last.unsqueeze(-1))
+        held = torch.cat([series.t.diff(), series.t.new_zeros(1)])
+        weight = inside * held / T.unsqueeze(-1)
 
         def mean(values: Tensor) -> Tensor:
             return torch.tensordot(weight, values, dims=1)
 
-        near = before.near & inside[..., None, None]
-        middle, width = _hull(before.angle, before.half, near)
-        may_be = near.any(1)
+        def never(values: Tensor) -> Tensor:
+            """Is it so at no sample of the window?"""
+            before = torch.cat([torch.zeros_like(values[:1], dtype=torch.long), values.long().cumsum(0)])
+            return before[last] == before[first]
+
+        middle, width, may_be = _hulls(series, first, count)
         A = torch.stack([middle.cos(), middle.sin()], dim=-1) * may_be.unsqueeze(-1)
-        u, C, d, drift = (
-            (now.x - before.x[first]) / T[:, None, None],
-            mean(before.C),
-            mean(before.d),
-            mean(before.drift),
-        )
-        whole = (before.observed | ~inside.unsqueeze(-1)).all(1) & now.observed & reached.unsqueeze(-1)
-        usable = whole & (before.usable | ~inside.unsqueeze(-1)).all(1)
+        u = (series.x[last] - series.x[first]) / T[..., None, None]
+        C, d, drift = mean(series.C), mean(series.d), mean(series.drift)
+        whole = never(~series.observed) & series.observed[last] & reached.unsqueeze(-1)
+        usable = whole & never(~series.usable)
         noise = self.model.noise
         assert noise is not None
-        ball = torch.as_tensor(noise.velocity).to(u) + (now.rho + before.rho[first]) / T.unsqueeze(-1)
+        ball = torch.as_tensor(noise.velocity).to(u) + (series.rho[last] + series.rho[first]) / T.unsqueeze(-1)
         corners = theta.vertices()
         if saturation is not None:
-            wishes = corners @ before.C.mT + before.d.unsqueeze(-2)
-            away = (wishes - (corners @ C.mT + d.unsqueeze(-2)).unsqueeze(1)).norm(dim=-1)
-            spread = (weight[..., None, None] * away).sum(1).amax(-1)
-            may_clip, idle = _clipping(wishes, saturation, before.drift)
-            ball = ball + spread * (may_clip & inside.unsqueeze(-1)).any(1)
-            usable = usable & ~(idle & inside.unsqueeze(-1)).any(1)
+            wishes = corners @ series.C.mT + series.d.unsqueeze(-2)
+            away = (wishes - (corners @ C.mT + d.unsqueeze(-2)).unsqueeze(2)).norm(dim=-1)
+            spread = (weight[..., None, None] * away).sum(2).amax(-1)
+            may_clip, idle = _clipping(wishes, saturation, series.drift)
+            ball = ball + spread * ~never(may_clip)
+            usable = usable & never(idle)
         b = torch.where(may_be, (A * u.unsqueeze(-2)).sum(-1), 1.0)
-        nothing = torch.zeros_like(b).flatten(0, 1)
-        errors = RowErrors(torch.where(may_be, width, 0.0).flatten(0, 1), nothing)
-        A, b, u, C, d, usable, ball, drift = (v.flatten(0, 1) for v in (A, b, u, C, d, usable, ball, drift))
+        nothing = torch.zeros_like(b).flatten(0, 2)
+        errors = RowErrors(width.flatten(0, 2), nothing)
+        A, b, u, C, d, usable, ball, drift = (v.flatten(0, 2) for v in (A, b, u, C, d, usable, ball, drift))
         no_row = torch.zeros_like(sample.hard)
-        corners = corners.expand(L, B, *corners.shape[1:]).flatten(0, 1)
+        corners = corners.expand(len(length), new, *corners.shape).flatten(0, 2)
         return Sample(Halfspaces(A, b), no_row, no_row, u, C, d, usable, nothing, ball, drift, errors, corners), whole
 
 
-def _hull(
-    angle: Float[Tensor, "S B m"], half: Float[Tensor, "S B m"], near: Bool[Tensor, "L S B m"]
-) -> tuple[Float[Tensor, "L B m"], Float[Tensor, "L B m"]]:
-    """The middle and the half width of an interval of angles that holds all directions of a row [rad]."""
-    reference = torch.atan2((angle.sin() * near).sum(1), (angle.cos() * near).sum(1)).unsqueeze(1)
-    ahead = torch.remainder(angle - reference + math.pi, 2 * math.pi) - math.pi
-    high = (ahead + half).masked_fill(~near, -math.inf).amax(1)
-    low = (ahead - half).masked_fill(~near, math.inf).amin(1)
-    some = near.any(1)
-    middle = torch.where(some, reference.squeeze(1) + (high + low) / 2, 0.0)
-    return middle, torch.where(some, (high - low) / 2, 0.0)
+def _hulls(
+    series: _Moments, first: Int[Tensor, "L S"], count: Int[Tensor, "L S"]
+) -> tuple[Float[Tensor, "L S B m"], Float[Tensor, "L S B m"], Bool[Tensor, "L S B m"]]:
+    """The middle and the half width of an interval of angles that holds all directions of a row in a window [rad].
+
+    Directions count where the row may be active, among the `count` samples from `first` on. The mask tells where some
+    do. The others have zeros.
+    """
+    searched = extreme_directions(*map(array, (series.angle, series.half, series.near, first, count)))
+    low, high, reference = (torch.from_numpy(part).to(series.angle.device) for part in searched)
+
+    def ahead(samples: Tensor, sign: float) -> Tensor:
+        place = samples.clamp(min=0).flatten(0, 1)
+        angle, half = (values.gather(0, place).view(samples.shape) for values in (series.angle, series.half))
+        return torch.remainder(angle - reference + math.pi, 2 * math.pi) - math.pi + sign * half
+
+    least, greatest, some = ahead(low, -1.0), ahead(high, 1.0), low >= 0
+    middle = torch.where(some, reference + (greatest + least) / 2, 0.0)
+    return middle, torch.where(some, (greatest - least) / 2, 0.0), some
 
 
 def _clipping(

@@ -29,7 +29,7 @@ OK, UNDECIDED, EMPTY = int(Status.OK), int(Status.UNDECIDED), int(Status.EMPTY)
 
 @item_of_ordered
 @no_type_check
-def _box(vertices, k, n):
+def box_of(vertices, k, n):
     x0 = x1 = vertices[k, 0, 0]
     y0 = y1 = vertices[k, 0, 1]
     for i in range(1, n):
@@ -52,28 +52,40 @@ def _beyond(vertices, k, n, p, q, c):
 
 @item
 @no_type_check
+def exceeded(vertices, k, n, reach, box, p, q, c):
+    """How far the vertices of polygon k exceed the line (p, q).z = c, and its round-off. Zeros if not by more.
+
+    The bounding box rules out many lines without a loop. The arrays of the batch are indexed, since views cost more.
+    """
+    x0, x1, y0, y1 = box
+    if p * (x1 if p > 0 else x0) + q * (y1 if q > 0 else y0) - c > 0:
+        tolerance = ROUND_OFF * (abs(p) * reach[k, 0] + abs(q) * reach[k, 1] + abs(c))
+        beyond = _beyond(vertices, k, n, p, q, c)
+        if beyond > tolerance:
+            return beyond, tolerance
+    return 0.0, 0.0
+
+
+@item
+@no_type_check
 def mark_cuts(vertices, k, n, reach, A, b, tolerance, depth, cutting):
     """Fill `cutting` with the rows that some vertex of polygon k exceeds by more than round-off, the deepest first.
 
-    The bounding box rules out many rows without a loop. The arrays of the batch are indexed, since views cost more.
-
     Returns the number of these rows.
     """
-    x0, x1, y0, y1 = _box(vertices, k, n)
+    box = box_of(vertices, k, n)
     found = 0
     for r in range(b.shape[1]):
-        p, q, c = A[k, r, 0], A[k, r, 1], b[k, r]
-        if p * (x1 if p > 0 else x0) + q * (y1 if q > 0 else y0) - c > 0:
-            tolerance[r] = ROUND_OFF * (abs(p) * reach[k, 0] + abs(q) * reach[k, 1] + abs(c))
-            beyond = _beyond(vertices, k, n, p, q, c)
-            if beyond > tolerance[r]:
-                depth[r] = beyond / math.sqrt(p * p + q * q)
-                s = found
-                while s > 0 and depth[cutting[s - 1]] < depth[r]:
-                    cutting[s] = cutting[s - 1]
-                    s -= 1
-                cutting[s] = r
-                found += 1
+        p, q = A[k, r, 0], A[k, r, 1]
+        beyond, slack = exceeded(vertices, k, n, reach, box, p, q, b[k, r])
+        if beyond > 0:
+            tolerance[r], depth[r] = slack, beyond / math.sqrt(p * p + q * q)
+            s = found
+            while s > 0 and depth[cutting[s - 1]] < depth[r]:
+                cutting[s] = cutting[s - 1]
+                s -= 1
+            cutting[s] = r
+            found += 1
     return found
 
 
@@ -270,7 +282,7 @@ def moved_around(vertices, count, reach, A, b):
     moved = b.copy()
     for k in range(len(b)):
         n = count[k]
-        x0, x1, y0, y1 = _box(vertices, k, n)
+        x0, x1, y0, y1 = box_of(vertices, k, n)
         for r in range(b.shape[1]):
             p, q, c = A[k, r, 0], A[k, r, 1], b[k, r]
             round_off = ROUND_OFF * (abs(p) * reach[k, 0] + abs(q) * reach[k, 1] + abs(c))

@@ -174,8 +174,9 @@ class Log:
         neighbour_velocities: Collection[str],
         required: Collection[str] = (),
         arrival_errors: Float[np.ndarray, "times bodies"] | None = None,
+        block: int | None = None,
     ) -> Iterator[Measurement]:
-        """One measurement per time, of the batch of these robots among all bodies.
+        """One measurement per time, of the batch of these robots among all bodies, or several concatenated.
 
         If the log has accelerations, they are the controls. A robot is `observed` where its control is known, the
         `required` bodies are there, and what the rows use of other bodies is known: the `neighbour_velocities`, and all
@@ -190,6 +191,7 @@ class Log:
             required: bodies without which a measurement says nothing, such as the leader of a formation.
             arrival_errors: how far velocities on arrival at the next sample may be from those logged (`contacts`)
                 [m/s].
+            block: how many times are concatenated to one measurement. None: each measurement has one time.
 
         Raises:
             LogError: the log has no velocities, or no body of that name.
@@ -218,41 +220,40 @@ class Log:
             if arrival_errors is not None and arrival_errors.any():
                 pushed = _one_earlier(arrival_errors)
                 neighbour_error = pushed if neighbour_error is None else neighbour_error + pushed
-        return self._measurements(self.u, index, observed, neighbour_error)
+        return self._measurements(self.u, index, observed, neighbour_error, block)
 
     def _measurements(
-        self, velocities: np.ndarray, robots: list[int], observed: np.ndarray, neighbour_error: np.ndarray | None
+        self,
+        velocities: np.ndarray,
+        robots: list[int],
+        observed: np.ndarray,
+        neighbour_error: np.ndarray | None,
+        block: int | None,
     ) -> Iterator[Measurement]:
         import torch
 
         from torchfsid.robots.measurement import Measurement
 
-        x, u, seen, observes = (torch.from_numpy(array) for array in (self.x, velocities, self.seen, observed))
-        previous_u = torch.from_numpy(_one_earlier(velocities))
-        radius, x_error, u_error, bodies_u_error, a, a_error = (
-            None if array is None else torch.from_numpy(array)
-            for array in (
-                self.radius, self.position_error, self.velocity_error, neighbour_error, self.a, self.acceleration_error
-            )
-        )  # fmt: skip
-        for k, t in enumerate(self.t.tolist()):
-            team = Measurement.of_team(
-                t,
-                x[k],
-                u[k],
-                robots=robots,
-                previous_u=previous_u[k],
-                acceleration=None if a is None else a[k],
-                acceleration_error=None if a_error is None else a_error[k],
-                radius=radius,
-                seen=seen[k],
-                position_error=None if x_error is None else x_error[k],
-                velocity_error=None if u_error is None else u_error[k],
-            )
-            if bodies_u_error is not None and a is None:
-                errors = bodies_u_error[k]
-                team = replace(team, body_velocity_error=errors.expand_as(team.present), arrival_error=errors[robots])
-            yield replace(team, observed=observes[k])
+        fields = {
+            "x": self.x,
+            "u": velocities,
+            "previous_u": _one_earlier(velocities),
+            "acceleration": self.a,
+            "acceleration_error": self.acceleration_error,
+            "seen": self.seen,
+            "position_error": self.position_error,
+            "velocity_error": self.velocity_error,
+            "neighbour_error": neighbour_error if self.a is None else None,
+        }
+        series = {name: torch.from_numpy(array) for name, array in fields.items() if array is not None}
+        radius = None if self.radius is None else torch.from_numpy(self.radius)
+        observes, times = torch.from_numpy(observed), self.t.tolist()
+        for k in range(0, len(times), block or 1):
+            part = k if block is None else slice(k, k + block)
+            t = times[k] if block is None else torch.tensor(times[k : k + block], dtype=torch.float64)
+            at_times = {name: values[part] for name, values in series.items()}
+            team = Measurement.of_team(t, **at_times, robots=robots, radius=radius)
+            yield replace(team, observed=observes[part].flatten())
 
 
 def _one_earlier(values: np.ndarray) -> np.ndarray:

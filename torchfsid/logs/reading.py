@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import islice
 
 import numpy as np
 from jaxtyping import Float
 
 NEGLIGIBLE = 1e-10
 """Unit of the last decimal from which on rounding is not counted [m], [m/s], [m/s2]: numbers of 12 digits are exact."""
+
+BATCH = 10_000
+"""Texts that are looked at together."""
 
 ALL_DIGITS = 17
 """Significant digits of which every double can be read back."""
@@ -66,7 +70,7 @@ def half_units(
         power: the power of ten by which the texts have to be multiplied for SI units. Whole are numbers in these.
     """
     decimals, digits = 0, 0
-    for text in set(texts):
+    for text in _distinct(texts):
         mantissa, _, exponent = text.strip().lower().partition("e")
         whole, _, fraction = mantissa.lstrip("+-").partition(".")
         digits = max(digits, len((whole + fraction).lstrip("0")))
@@ -78,3 +82,11 @@ def half_units(
     first = np.floor(np.log10(np.maximum(np.abs(values), 10.0**-decimals)))
     units = np.maximum(10.0**-decimals, 10.0 ** (first + 1 - digits))
     return np.where(units > NEGLIGIBLE, units / 2, 0.0)
+
+
+def _distinct(texts: Iterable[str]) -> Iterator[str]:
+    """The texts without repetitions, a batch at a time: often the first ones tell enough."""
+    rest, seen = iter(texts), set[str]()
+    while batch := set(islice(rest, BATCH)):
+        yield from batch - seen
+        seen |= batch

@@ -17,10 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
+from torchfsid.logs.large_csv import csv_table
 from torchfsid.logs.log import Log
 from torchfsid.logs.quantities import heading_in, quantities_in, radii_in, repeats_in, times_in
 from torchfsid.logs.reading import UNITS, Reading
-from torchfsid.logs.tables import CsvTable, ParquetTable, Table, require_column
+from torchfsid.logs.tables import ParquetTable, Table, require_column
 
 
 def read_csv(path: str | Path, heading: str | None = None) -> Log:
@@ -33,7 +34,7 @@ def read_csv(path: str | Path, heading: str | None = None) -> Log:
     Raises:
         LogError: the file cannot be read, or is not such a log. The message names the line and the column.
     """
-    return _log_in(CsvTable(str(path)), heading)
+    return _log_in(csv_table(str(path)), heading)
 
 
 def read_parquet(path: str | Path, heading: str | None = None) -> Log:

@@ -15,8 +15,11 @@ unknown, every robot has a set Psi of its own beside its Theta.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import islice
 from typing import NamedTuple
 
 import torch
@@ -26,6 +29,7 @@ from torch import Tensor
 from torchfsid.identification.by_robot import by_robot
 from torchfsid.identification.evidence import Evidence, ObservationModel, evidence
 from torchfsid.identification.safety_parameters import LearningModel, Possible
+from torchfsid.observers.blocks import times_of
 from torchfsid.robots.barriers import Barrier
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.measurement import Measurement
@@ -58,12 +62,6 @@ class Block:
         """The time of each item, a robot's sample [s]."""
         return torch.as_tensor(self.measurement.t, dtype=torch.float64)
 
-    @classmethod
-    def of(cls, samples: Sequence[Measurement]) -> Block:
-        return cls(
-            torch.tensor([sample.time for sample in samples], dtype=torch.float64), Measurement.concatenate(samples)
-        )
-
     def repeated(self, of_robots: Tensor) -> Tensor:
         """The values `of_robots`, repeated for each sample of the block."""
         return of_robots.repeat(len(self.times), *[1] * (of_robots.ndim - 1))
@@ -81,7 +79,8 @@ class Consistency:
     """The consistency of a log with a model of robots that share a task and barriers.
 
     Args:
-        measurements: the samples in the order of time, all of the same robots.
+        measurements: the samples in the order of time, all of the same robots. Either a list of single samples, or
+            blocks of samples, concatenated, that can be iterated over again and again: of a long log, not all is kept.
         task: the task of all robots.
         barriers: the barriers of all robots.
         prior: the robots' prior sets, batch (B,).
@@ -91,7 +90,7 @@ class Consistency:
 
     def __init__(
         self,
-        measurements: Sequence[Measurement],
+        measurements: Iterable[Measurement],
         task: Task,
         barriers: Sequence[Barrier | UnknownAvoidance],
         prior: FeasibleSet,
@@ -103,8 +102,28 @@ class Consistency:
         self.robots = prior.batch_shape[0]
         unknown = [barrier for barrier in barriers if isinstance(barrier, UnknownAvoidance)]
         self.psi = unknown[0].prior(self.robots) if unknown else None
-        self.blocks = [Block.of(measurements[k : k + BLOCK]) for k in range(0, len(measurements), BLOCK)]
-        self.fastest = max(float(sample.u.norm(dim=-1).max()) for sample in measurements if sample.u is not None)
+        if isinstance(measurements, Sequence):
+            samples = range(0, len(measurements), BLOCK)
+            measurements = [Measurement.concatenate(measurements[k : k + BLOCK]) for k in samples]
+        self._measurements = measurements
+
+    @property
+    def blocks(self) -> Iterator[Block]:
+        """The samples, block by block."""
+        for measurement in self._measurements:
+            yield Block(times_of(measurement, self.robots), measurement)
+
+    def thinned(self, most: int) -> Consistency:
+        """The same for at most so many blocks, evenly spread over the log, with its `fastest`."""
+        step = math.ceil(sum(1 for _ in self._measurements) / most)
+        other = copy(self)
+        other.fastest, other._measurements = self.fastest, list(islice(self._measurements, 0, None, step))
+        return other
+
+    @cached_property
+    def fastest(self) -> float:
+        """The size of the largest control."""
+        return max(float(of.u.norm(dim=-1).max()) for of in self._measurements if of.u is not None)
 
     def smallest_bounds(self, largest: float) -> Float[Tensor, "B"]:
         """delta_i of every robot, too large by at most `RESOLUTION`. Infinite if it is above `largest`."""

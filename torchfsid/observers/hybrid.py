@@ -18,6 +18,7 @@ the gradient leaves out what earlier projections changed in the filter.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -25,9 +26,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchfsid.errors import InputError, SolverError
+from torchfsid.observers.blocks import one_by_one
 from torchfsid.observers.safety import SafetyObserver, SetObserver
-from torchfsid.observers.set_membership import SetEstimate, rounded
-from torchfsid.observers.ukf import ParameterUkf, UkfEstimate
+from torchfsid.observers.set_membership import SetEstimate, SetEstimates, rounded
+from torchfsid.observers.ukf import ParameterUkf
+from torchfsid.observers.ukf_estimates import UkfEstimate, UkfEstimates
 from torchfsid.outcome import Status
 from torchfsid.robots.measurement import Measurement
 from torchfsid.sets.feasible_set import FeasibleSet
@@ -63,6 +66,30 @@ class HybridEstimate:
         return f"HybridEstimate(t={self.t:g}, theta={rounded(self.theta)}, {self.set_estimate!r})"
 
 
+@dataclass(frozen=True)
+class HybridEstimates:
+    """The estimates of both observers at S times. `estimates[s]` is the `HybridEstimate` of time s.
+
+    Attributes:
+        theta: see `HybridEstimate`.
+        set_estimates: those of the set-membership observer.
+        ukf_estimates: those of the filter.
+        status: see `HybridEstimate`.
+    """
+
+    theta: Float[Tensor, "S B p"]
+    set_estimates: SetEstimates
+    ukf_estimates: UkfEstimates
+    status: Int[Tensor, "S B"]
+
+    def __len__(self) -> int:
+        return len(self.set_estimates)
+
+    def __getitem__(self, s: int) -> HybridEstimate:
+        sets, ukf = self.set_estimates[s], self.ukf_estimates[s]
+        return HybridEstimate(sets.t, self.theta[s], sets, ukf, self.status[s])
+
+
 @dataclass
 class HybridObserver:
     """A set-membership observer and a filter on the same measurements.
@@ -91,21 +118,45 @@ class HybridObserver:
         Raises:
             InputError: see `SetMembershipObserver.update` and `ParameterUkf.update`.
         """
-        set_estimate = self.sets.update(measurement)
+        set_estimates = SetEstimates.of(self.sets.update(measurement))
+        return self._with_filter(set_estimates, measurement)[0]
+
+    def read(self, samples: Measurement) -> Iterator[HybridEstimates]:
+        """Take in several measurements, see `SetMembershipObserver.read`. With feedback, estimates come one by one.
+
+        Raises:
+            InputError: see `update`.
+            InconsistentError: see `SetMembershipObserver.read`.
+        """
+        robots, first = len(self.ukf.mean), 0
+        if self.feedback and len(samples.x) > robots:
+            for sample in one_by_one(samples, robots):
+                yield from self.read(sample)
+            return
+        for set_estimates in self.sets.read(samples):
+            end = first + len(set_estimates) * robots
+            yield self._with_filter(set_estimates, samples.select(slice(first, end)))
+            first = end
+
+    def _with_filter(self, set_estimates: SetEstimates, samples: Measurement) -> HybridEstimates:
         if isinstance(self.sets, SafetyObserver):
             self.ukf.barriers = self.sets.present_barriers
-        ukf_estimate = self.ukf.update(measurement)
-        theta, status = _into(set_estimate.feasible_set, ukf_estimate)
+        found = self.ukf.read(samples)
+        sets, which = set_estimates.sets, set_estimates.which
+        sets = sets if len(which) == 1 else sets.select(which.flatten())
+        theta, status = _into(sets, found.theta.flatten(0, 1), found.covariance.flatten(0, 1))
         if self.feedback and bool(theta.isfinite().all()):
             self.ukf.correct(theta)
-        return HybridEstimate(set_estimate.t, theta, set_estimate, ukf_estimate, status)
+        return HybridEstimates(theta.view(*which.shape, -1), set_estimates, found, status.view(which.shape))
 
 
-def _into(sets: FeasibleSet, estimate: UkfEstimate) -> tuple[Float[Tensor, "B p"], Int[Tensor, "B"]]:
-    """The filter's estimates projected onto the sets, and a `Status` for each robot."""
-    metric, usable = _information_metric(estimate.covariance)
-    known = estimate.theta.isfinite().all(-1)
-    start = torch.where(known.unsqueeze(-1), estimate.theta, 0.0)
+def _into(
+    sets: FeasibleSet, theta: Float[Tensor, "B p"], covariance: Float[Tensor, "B p p"]
+) -> tuple[Float[Tensor, "B p"], Int[Tensor, "B"]]:
+    """The filters' estimates projected onto the sets, and a `Status` for each."""
+    metric, usable = _information_metric(covariance)
+    known = theta.isfinite().all(-1)
+    start = torch.where(known.unsqueeze(-1), theta, 0.0)
     try:
         theta = sets.project(start, metric)
     except SolverError:

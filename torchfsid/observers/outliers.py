@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchfsid.halfspaces import Halfspaces
@@ -71,13 +71,15 @@ def possible(found: Evidence) -> Halfspaces:
     )
 
 
-def narrowed(levels: Levels, omega: Halfspaces, t: float) -> tuple[Levels, Bool[Tensor, "B"]]:
-    """The levels after one more sample, and whether a parameter of the last one explains it.
+def narrowed(levels: Levels, omega: Halfspaces, t: float | Float[Tensor, "B"]) -> tuple[Levels, Bool[Tensor, "B"]]:
+    """The levels after one more sample of each robot at t [s], and whether a parameter of the last one explains it.
 
     A level is EMPTY if no parameter is left of it.
     """
-    found = [levels[0].intersect(omega, t)]
-    found += [level.intersect(moved_around(omega, below), t) for below, level in pairwise(levels)]
+    times = torch.as_tensor(t, dtype=torch.float64).expand(levels[0].batch_shape)
+    stamp = times.unsqueeze(-1)
+    found = [levels[0].intersect(omega, stamp)]
+    found += [level.intersect(moved_around(omega, below), stamp) for below, level in pairwise(levels)]
     explained = ~found[-1].is_empty
     if len(levels) == 1 or not any(level.any_empty for level in found):
         return tuple(found), explained
@@ -86,8 +88,8 @@ def narrowed(levels: Levels, omega: Halfspaces, t: float) -> tuple[Levels, Bool[
     if bool(emptied.any()):
         suspect = omega.where(emptied.unsqueeze(-1))
         for j, (below, level) in enumerate(pairwise(levels), start=1):
-            explained = ~level.intersect(suspect, t).is_empty
-            shifted = replace(below, last_cut=torch.full_like(below.last_cut, t))
+            explained = ~level.intersect(suspect, stamp).is_empty
+            shifted = replace(below, last_cut=times)
             found[j] = found[j].where(explained | below.is_empty, shifted)
     return tuple(found), explained
 

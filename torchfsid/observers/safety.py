@@ -12,7 +12,7 @@ single robots' sets may lag behind by a few samples, which are read together.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -21,9 +21,17 @@ from torch import Tensor
 
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.identification.safety_parameters import LearningModel, Possible, Reading
+from torchfsid.observers.blocks import one_by_one
 from torchfsid.observers.safety_sets import Refutation, SafetySets
 from torchfsid.observers.second_look import MOST_CELLS
-from torchfsid.observers.set_membership import Event, OnInconsistent, SetEstimate, SetMembershipObserver, require_prior
+from torchfsid.observers.set_membership import (
+    Event,
+    OnInconsistent,
+    SetEstimate,
+    SetEstimates,
+    SetMembershipObserver,
+    require_prior,
+)
 from torchfsid.outcome import Status
 from torchfsid.robots.arguments import require_task
 from torchfsid.robots.barriers import Barrier
@@ -165,6 +173,16 @@ class SafetyObserver:
         informative = read.evidence.informative & ~read.theta.is_empty
         psi = self.possible.psi
         return SetEstimate(measurement.time, self.feasible_set, read.evidence, informative, self.status, psi)
+
+    def read(self, samples: Measurement) -> Iterator[SetEstimates]:
+        """Take in several measurements of all robots, concatenated in the order of time. Estimates come one by one.
+
+        Raises:
+            InputError: see `update`.
+            InconsistentError: see `update`.
+        """
+        for sample in one_by_one(samples, self.robots):
+            yield SetEstimates.of(self.update(sample))
 
     def look_again(self, measurements: Sequence[Measurement], most: int = MOST_CELLS) -> None:
         """Read all measurements again, for smaller sets (`second_look`). Theta and Psi never grow.

@@ -16,7 +16,8 @@ all parameters that explain the others, and the two failures above are those of 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any, Literal, get_args
@@ -29,7 +30,8 @@ from torchfsid.errors import InconsistentError, InputError
 from torchfsid.identification.evidence import Evidence, ObservationModel, SetKind, evidence
 from torchfsid.identification.kkt import KktSolution
 from torchfsid.identification.windows import Windows
-from torchfsid.observers.outliers import SetAside, narrowed, possible, set_aside
+from torchfsid.observers.blocks import Course, depends_on_theta, joined, one_by_one, times_of
+from torchfsid.observers.outliers import SetAside, possible, set_aside
 from torchfsid.outcome import Status
 from torchfsid.robots.arguments import require_choice, require_task
 from torchfsid.robots.barriers import Barrier
@@ -97,6 +99,57 @@ class SetEstimate:
     def theta(self) -> Float[Tensor, "B p"]:
         """The centroid of each set. Unlike the Chebyshev centre it does not jump along an elongated set."""
         return self.feasible_set.centroid()
+
+
+@dataclass(frozen=True)
+class SetEstimates:
+    """The sets at S times, one after the other. `estimates[s]` is the `SetEstimate` of time s.
+
+    Attributes:
+        t: times [s].
+        sets: all sets Theta of all robots that there were, batch (K,).
+        which: for each time and robot, its place in `sets`.
+        evidence: the evidence of the S*B samples, time by time.
+        informative: see `SetEstimate`.
+        status: see `SetEstimate`.
+        safety: see `SetEstimate`. It comes with single times only.
+    """
+
+    t: Float[Tensor, "S"]
+    sets: FeasibleSet
+    which: Int[Tensor, "S B"]
+    evidence: Evidence
+    informative: Bool[Tensor, "S B"]
+    status: Int[Tensor, "S B"]
+    safety: FeasibleSet | None = None
+
+    @classmethod
+    def of(cls, estimate: SetEstimate) -> SetEstimates:
+        """An estimate as those of one time."""
+        return cls(
+            torch.tensor([estimate.t], dtype=torch.float64),
+            estimate.feasible_set,
+            torch.arange(len(estimate.status)).unsqueeze(0),
+            estimate.evidence,
+            estimate.informative.unsqueeze(0),
+            estimate.status.unsqueeze(0),
+            estimate.safety,
+        )
+
+    @property
+    def kkt(self) -> KktSolution:
+        """See `SetEstimate`, for the S*B samples."""
+        return self.evidence.kkt
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def __getitem__(self, s: int) -> SetEstimate:
+        sets, evidence, (samples, robots) = self.sets, self.evidence, self.which.shape
+        if samples > 1:
+            place = range(samples)[s] * robots
+            sets, evidence = sets.select(self.which[s]), evidence.select(torch.arange(place, place + robots))
+        return SetEstimate(float(self.t[s]), sets, evidence, self.informative[s], self.status[s], self.safety)
 
 
 @dataclass
@@ -168,20 +221,52 @@ class SetMembershipObserver:
             InputError: see `evidence`, or the robots were measured at different times.
             InconsistentError: an intersection is empty, and `on_inconsistent` is `raise`.
         """
-        t = measurement.time
+        if len(measurement.x) != len(self.status):
+            raise InputError("measurement", f"{len(self.status)} robots", tuple(measurement.x.shape))
+        return self._take_in(measurement)[0]
+
+    def read(self, samples: Measurement) -> Iterator[SetEstimates]:
+        """Take in several measurements of all robots, concatenated in the order of time.
+
+        The sets are those of `update`. If what the samples say does not depend on the sets (`depends_on_theta`), it is
+        computed for all of them at once, and their estimates come together. Otherwise estimates come one by one.
+
+        Raises:
+            InputError: see `update`.
+            InconsistentError: see `update`. It is raised when all estimates before that sample have been returned.
+        """
+        robots = len(self.status)
+        if len(samples.x) > robots and not depends_on_theta(self.model, samples.observed_only()):
+            windows = copy(self._windows)
+            try:
+                yield self._take_in(samples)
+                return
+            except InconsistentError:  # nothing was taken in: find the sample
+                self._windows = windows
+        for sample in one_by_one(samples, robots):
+            yield self._take_in(sample)
+
+    def _take_in(self, samples: Measurement) -> SetEstimates:
+        robots, reset = len(self.status), self.on_inconsistent == "reset"
+        times = times_of(samples, robots)
+        shape = len(times), robots
         read = partial(evidence, self.model) if self._windows is None else self._windows.read
-        found = read(self.feasible_set, measurement, self.compiled)
-        omega = possible(found) if self.outliers else found.omega
-        (*below, theta), explained = narrowed((*self._below, self.feasible_set), omega, t)
-        as_outliers = found.alarmed & (self.outliers > 0)  # these alarms empty a level, those beyond the q the last one
-        alarmed, lost = found.alarmed & (theta.is_empty | ~as_outliers), theta.is_empty & ~as_outliers
-        if theta.any_empty or bool(alarmed.any()):
-            self._report(t, alarmed, found.slack, lost, theta)
-            theta = theta.where(~theta.is_empty, self._instead())
-        self._below, self.feasible_set = tuple(below), theta
-        self.skipped = self.skipped + ~found.informative
-        self.infeasible = self.infeasible + found.infeasible
-        return SetEstimate(t, self.feasible_set, found, found.informative & explained, self.status)
+        found = read(self.feasible_set, samples, self.compiled)
+        course = Course((*self._below, self.feasible_set), possible(found) if self.outliers else found.omega, times)
+        course.run(self.prior if reset else None, contradicting)
+        alarmed, lost = found.alarmed.view(shape), course.lost
+        if self.outliers:  # alarms among outliers empty a level, those beyond the q the last one
+            alarmed, lost = alarmed & lost, lost & ~alarmed
+        status = self.status.expand(shape)
+        if bool(alarmed.any()) or bool(lost.any()):
+            status = self._report(times, alarmed, lost, found.slack, course)
+        *below, self.feasible_set = course.levels
+        self._below, self.status = tuple(below), status[-1]
+        informative = found.informative.view(shape)
+        self.skipped = self.skipped + (~informative).sum(0)
+        self.infeasible = self.infeasible + found.infeasible.view(shape).sum(0)
+        explained = informative & course.explained
+        return SetEstimates(times, joined(course.parts), course.which, found, explained, status)
 
     @property
     def windows_used(self) -> dict[float, float]:
@@ -200,24 +285,32 @@ class SetMembershipObserver:
         """The samples that are left unexplained, robot by robot, in the order of time."""
         return set_aside((*self._below, self.feasible_set))
 
-    def _instead(self) -> FeasibleSet:
-        """The sets that replace empty ones: the sets as they were, or the prior."""
-        return self.feasible_set if self.on_inconsistent == "hold" else self.prior
+    def _report(self, times: Tensor, alarmed: Tensor, lost: Tensor, slack: Tensor, course: Course) -> Tensor:
+        """Record what went wrong for the first time. Returns the status after each sample.
 
-    def _report(self, t: float, alarmed: Tensor, slack: Tensor, lost: Tensor, theta: FeasibleSet) -> None:
-        """Record what went wrong for the first time, and raise the statuses, or an exception if that is asked for."""
-        for robot in (alarmed & (self.status < Status.ALARM)).nonzero().flatten().tolist():
-            row = int(slack[robot].argmin())
-            self.events.append(Event(t, robot, Status.ALARM, ((t, row),)))
-        reset = self.on_inconsistent == "reset"
-        for robot in (lost & (self.status < Status.INCONSISTENT)).nonzero().flatten().tolist():
-            self.events.append(Event(t, robot, Status.INCONSISTENT, contradicting(theta, robot), reset))
-        self.status = torch.where(alarmed, self.status.clamp(min=Status.ALARM), self.status)
-        if not reset:
-            self.status = torch.where(lost, Status.INCONSISTENT, self.status)
-        if self.on_inconsistent == "raise" and bool(lost.any()):
-            robot = int(lost.int().argmax())
-            raise InconsistentError(robot, t, contradicting(theta, robot))
+        Raises:
+            InconsistentError: a set is empty, and that is asked for. If there are several samples, nothing was changed.
+        """
+        reset, robots = self.on_inconsistent == "reset", len(self.status)
+        raised = torch.where(alarmed, int(Status.ALARM), self.status)
+        raised = raised if reset else torch.where(lost, int(Status.INCONSISTENT), raised)
+        status = torch.maximum(raised.cummax(0).values, self.status)
+        before = torch.cat([self.status.unsqueeze(0), status[:-1]])
+        events = []
+        for s, robot in (alarmed & (before < Status.ALARM)).nonzero().tolist():
+            row = int(slack[s * robots + robot].argmin())
+            events.append((s, Event(float(times[s]), robot, Status.ALARM, ((float(times[s]), row),))))
+        for s, robot in (lost & (before < Status.INCONSISTENT)).nonzero().tolist():
+            proof = course.proofs[s, robot]
+            events.append((s, Event(float(times[s]), robot, Status.INCONSISTENT, proof, reset)))
+        stops = self.on_inconsistent == "raise" and bool(lost.any())
+        if not stops or len(times) == 1:
+            self.events += [event for _, event in sorted(events, key=lambda found: found[0])]
+            self.status = status[-1]
+        if stops:
+            s, robot = lost.nonzero()[0].tolist()
+            raise InconsistentError(robot, float(times[s]), course.proofs[s, robot])
+        return status
 
 
 def rounded(theta: Float[Tensor, "B p"]) -> list[list[float]]:

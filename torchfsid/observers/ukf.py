@@ -16,7 +16,7 @@ Failures of the data are reported as a status and raise nothing:
       again from it, theta's mean stays, and its covariance grows by the drift. The last (G, f) is not held, since that
       motion was not observed;
     - the covariance is no longer positive definite (round-off). Its eigenvalues, in units of prior and position noise,
-      are raised to `DEFINITE` times the largest. The covariance only grows by this;
+      are raised to `definite.DEFINITE` times the largest. The covariance only grows by this;
     - the filter fails (an overflow, a covariance that cannot be factored). It starts again from its prior.
 """
 
@@ -25,31 +25,26 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter, unscented_transform
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torchfsid.errors import InputError, SolverError
-from torchfsid.halfspaces import Halfspaces
-from torchfsid.identification.active_set import active_set
-from torchfsid.identification.kkt import solve_kkt
-from torchfsid.observers.motions import Array, Motion, ObservedMotion, QpMotion, Wish
+from torchfsid.kernels.kalman import advance
+from torchfsid.observers.blocks import times_of
+from torchfsid.observers.definite import FLOOR, make_definite
+from torchfsid.observers.motions import Array, Motion, Motions, ObservedMotion, read_motions
+from torchfsid.observers.ukf_estimates import UkfEstimate, UkfEstimates
 from torchfsid.outcome import Status
 from torchfsid.robots.arguments import require_barriers, require_task
-from torchfsid.robots.barriers import Barrier, controller_failed, stack_barriers
+from torchfsid.robots.barriers import Barrier
 from torchfsid.robots.measurement import Measurement
-from torchfsid.robots.tasks import Task, feedback_of
+from torchfsid.robots.tasks import Task
 from torchfsid.tolerances import ACTIVE_TOLERANCE
-
-FLOOR = 1e-8
-"""Noises per step are at least this fraction of the position noise (x) and of the prior's spread (theta)."""
-
-DEFINITE = 1e-13
-"""A repaired covariance's smallest eigenvalue over its largest: a little more than a Cholesky factorisation needs."""
 
 FAILURES = (np.linalg.LinAlgError, ArithmeticError, ValueError)
 """What numpy, scipy and filterpy raise for numbers they cannot work with."""
@@ -61,26 +56,7 @@ SIGMA_POINTS = {"alpha": 1.0, "beta": 2.0, "kappa": 0.0}
 """No weight is negative, so that a prediction stays positive definite; alpha < 0.1 loses digits to cancellation."""
 
 
-@dataclass(frozen=True)
-class UkfEstimate:
-    """The filters' estimates at time t.
-
-    Attributes:
-        t: time [s].
-        theta: the mean of theta.
-        covariance: the covariance of theta.
-        status: a `Status` per robot, for this measurement alone.
-    """
-
-    t: float
-    theta: Float[Tensor, "B p"]
-    covariance: Float[Tensor, "B p p"]
-    status: Int[Tensor, "B"]
-
-    @property
-    def status_names(self) -> list[str]:
-        """The statuses in words, one per robot."""
-        return Status.names(self.status)
+Engine = Literal["filterpy", "batch"]
 
 
 @dataclass
@@ -100,11 +76,14 @@ class ParameterUkf:
         active_tolerance: the slack below which a row counts as active [m/s]. The motion is unknown if a row is violated
             by more than this.
         qp_inside: whether to solve the QP at every sigma point.
+        engine: `filterpy`, or `batch`: the same filter for all robots at once in compiled code (`kernels.kalman`), for
+            long logs. Its numbers are those of filterpy up to round-off. It needs a linear model: no QP inside, and
+            nominal controls that are not clipped. filterpy still repairs covariances.
         filters: filterpy's filter for each robot; None while its position or its motion is not known.
 
     Raises:
-        InputError: `mean` is not (B, p), `spread` does not fit it, or a spread or noise is not positive (drift and
-            motion noise may be zero).
+        InputError: `mean` is not (B, p), `spread` does not fit it, a spread or noise is not positive (drift and motion
+            noise may be zero), or `engine` is `batch` and the model not linear.
     """
 
     task: Task
@@ -116,6 +95,7 @@ class ParameterUkf:
     motion_noise: float = 1e-3
     active_tolerance: float = ACTIVE_TOLERANCE
     qp_inside: bool = False
+    engine: Engine = "filterpy"
     filters: list[UnscentedKalmanFilter | None] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -135,6 +115,8 @@ class ParameterUkf:
         positive = self.position_noise > 0 and self.active_tolerance > 0
         if not (positive and min(noises) >= 0 and math.isfinite(sum(noises))):
             raise InputError("noises", "position_noise > 0, active_tolerance > 0, the others >= 0", noises)
+        if self.engine == "batch" and (self.qp_inside or self.task.saturation is not None):
+            raise InputError("engine", "filterpy, since the model is not linear", self.engine)
         with np.errstate(over="ignore"):  # a spread whose square overflows: such a filter fails, later
             variances = self._scale[:, :, None] ** 2
         self._prior = self.mean.detach().to(torch.float64).numpy(), np.where(np.eye(p) > 0, variances, 0.0)
@@ -163,33 +145,100 @@ class ParameterUkf:
         Raises:
             InputError: the measurement has no velocities or another batch, or its time does not increase.
         """
+        self._require(measurement, len(measurement.x) == len(self.mean))
+        return self.read(measurement)[0]
+
+    def read(self, samples: Measurement) -> UkfEstimates:
+        """Take in several measurements of all robots, concatenated in the order of time.
+
+        Raises:
+            InputError: see `update`.
+        """
         robots = len(self.mean)
-        if measurement.u is None or measurement.x.ndim != 2 or len(measurement.x) != robots:
-            raise InputError("measurement", f"positions and velocities ({robots}, n)", tuple(measurement.x.shape))
-        t = measurement.time
-        if not (math.isfinite(t) and t > self._t):
-            raise InputError("measurement.t", f"a time after {self._t}", t)
+        self._require(samples, samples.u is not None)
+        times = times_of(samples, robots)
+        since = torch.cat([times.new_tensor([self._t]), times])
+        late = ~(times.isfinite() & (since.diff() > 0))
+        if bool(late.any()):
+            raise InputError("measurement.t", f"a time after {float(since[:-1][late][0])}", float(times[late][0]))
         with torch.no_grad():
-            motions = self._read_motions(measurement)
-        state = measurement.velocity if measurement.is_second_order else measurement.x
+            motions = read_motions(self.task, self.barriers, samples, self.active_tolerance, self.qp_inside)
+        state = samples.velocity if samples.is_second_order else samples.x
         if state is None:
             raise InputError("measurement.velocity", "the velocities of the robots, of second order", None)
         seen = (state.abs() < FARTHEST).all(-1)
-        if measurement.observed is not None:
-            seen = seen & measurement.observed
-        dt = t - self._t if math.isfinite(self._t) else 0.0
+        if samples.observed is not None:
+            seen = seen & samples.observed
 
-        x = state.detach().to(torch.float64).numpy()
+        shape = len(times), robots
+        steps = since.diff().nan_to_num(posinf=0.0).numpy()
+        x, seen = state.detach().to(torch.float64).numpy().reshape(*shape, -1), seen.numpy().reshape(shape)
+        take_in = self._in_batch if self.engine == "batch" else self._in_turn
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            status = [self._update_robot(i, dt, x[i] if seen[i] else None) for i in range(robots)]
-        self._t, self._motions = t, motions
-        self.filters = [kalman if motion else None for kalman, motion in zip(self.filters, motions, strict=True)]
-        return UkfEstimate(
-            t,
-            torch.from_numpy(self._theta.copy()),
-            torch.from_numpy(self._covariance.copy()),
-            torch.tensor(status, dtype=torch.long),
-        )
+            theta, covariance, status = map(torch.from_numpy, take_in(steps, x, seen, motions))
+        self._t = float(times[-1])
+        return UkfEstimates(times, theta, covariance, status)
+
+    def _require(self, samples: Measurement, fits: bool) -> None:
+        if samples.u is None or samples.x.ndim != 2 or not fits:
+            expected = f"positions and velocities ({len(self.mean)}, n)"
+            raise InputError("measurement", expected, tuple(samples.x.shape))
+
+    def _in_turn(self, steps: Array, x: Array, seen: Array, motions: Motions) -> tuple[Array, Array, Array]:
+        """Thetas, covariances and statuses after each sample, by filterpy."""
+        robots, theta, covariance, statuses = len(self.mean), [], [], []
+        for s, dt in enumerate(steps):
+            statuses.append([self._update_robot(i, dt, x[s, i] if seen[s, i] else None) for i in range(robots)])
+            self._motions = [motions[s * robots + i] for i in range(robots)]
+            now = zip(self.filters, self._motions, strict=True)
+            self.filters = [kalman if motion else None for kalman, motion in now]
+            theta.append(self._theta.copy())
+            covariance.append(self._covariance.copy())
+        return np.stack(theta), np.stack(covariance), np.array(statuses, dtype=np.int64)
+
+    def _in_batch(self, steps: Array, x: Array, seen: Array, motions: Motions) -> tuple[Array, Array, Array]:
+        """The same by compiled code. filterpy takes in the samples at which that stops."""
+        (samples, robots, n), p = x.shape, self._theta.shape[-1]
+        known = motions.known.numpy().reshape(samples, robots)
+        G, f = (part.numpy().reshape(samples, robots, *part.shape[1:]) for part in motions.linear)
+        moved, G, f = (np.concatenate([now[:1], now[:-1]]) for now in (known, G, f))  # since the sample before
+        for i, motion in enumerate(self._motions):
+            moved[0, i] = motion is not None
+            if isinstance(motion, ObservedMotion):
+                G[0, i], f[0, i] = motion.linear
+        running = np.array([kalman is not None for kalman in self.filters])
+        mean, P = np.zeros((robots, n + p)), np.zeros((robots, n + p, n + p))
+        for i, kalman in enumerate(self.filters):
+            if kalman is not None:
+                mean[i], P[i] = kalman.x, kalman.P
+        state = running, mean, P, self._theta, self._covariance
+        inputs = steps, x, seen, moved, known, G, f, self.position_noise**2, *self._noises(steps)
+        theta, covariance = np.empty((samples, robots, p)), np.empty((samples, robots, p, p))
+        status, start = np.empty((samples, robots), dtype=np.int64), np.zeros(robots, dtype=np.int64)
+        while (start < samples).any():
+            start = advance(start, *state, *inputs, theta, covariance, status)
+            for i in np.flatnonzero(start < samples).tolist():
+                s = int(start[i])
+                kalman = self.filters[i] = self._start(i, x[s, i])
+                kalman.x, kalman.P = mean[i].copy(), P[i].copy()
+                self._motions[i] = motions[(s - 1) * robots + i] if s > 0 else self._motions[i]
+                status[s, i] = self._update_robot(i, float(steps[s]), x[s, i])
+                kalman = self.filters[i]
+                assert kalman is not None
+                mean[i], P[i], running[i] = kalman.x, kalman.P, known[s, i]
+                theta[s, i], covariance[s, i] = self._theta[i], self._covariance[i]
+                start[i] = s + 1
+        self._motions = [motions[len(motions.known) - robots + i] for i in range(robots)]
+        self.filters = [self._start(i, mean[i, :n]) if running[i] else None for i in range(robots)]
+        for i, kalman in enumerate(self.filters):
+            if kalman is not None:
+                kalman.x, kalman.P = mean[i].copy(), P[i].copy()
+        return theta, covariance, status
+
+    def _noises(self, steps: Array) -> tuple[Array, Array]:
+        """Variances of the motion's error (S,) and of theta's drift (S, B, p) in these times."""
+        walk = np.maximum(self.motion_noise**2 * steps, (FLOOR * self.position_noise) ** 2)
+        return walk, np.maximum(self.process_noise**2 * steps[:, None, None], (FLOOR * self._scale) ** 2)
 
     def correct(self, theta: Float[Tensor, "B p"]) -> None:
         """Replace the means of theta, keep the covariances.
@@ -214,41 +263,13 @@ class ParameterUkf:
                     kalman.x = np.concatenate([kalman.x[:n] + kalman.P[:n, n:] @ change, corrected[i]])
         self._theta = corrected
 
-    def _read_motions(self, measurement: Measurement) -> list[Motion | None]:
-        """The motion of each robot from this measurement on, as a function of theta. None where it is unknown."""
-        assert measurement.u is not None
-        rows = stack_barriers(self.barriers, measurement)
-        C, d = self.task(measurement)
-        finite = [rows.A.flatten(1), rows.b, C.flatten(1), d, measurement.u]
-        known = torch.stack([values.isfinite().all(-1) for values in finite]).all(0)
-        if measurement.observed is not None:
-            known = known & measurement.observed
-        safe_controls = rows.where(known.unsqueeze(-1))
-        C = torch.where(known[:, None, None], C, 0.0).to(torch.float64)
-        d = torch.where(known[:, None], d, 0.0).to(torch.float64)
-        u = torch.where(known[:, None], measurement.u, 0.0).to(torch.float64)
-        slack = safe_controls.slack(u)
-        failed = controller_failed(self.barriers, measurement, safe_controls)
-        known = known & ~failed & (slack >= -self.active_tolerance).all(-1)
-        feedback = feedback_of(self.task, measurement)
-        feedback = torch.zeros_like(u) if feedback is None else torch.where(known[:, None], feedback, 0.0)
-        wishes = [Wish(*of_robot, self.task.saturation) for of_robot in zip(C, d, feedback, strict=True)]
-        if self.qp_inside:
-            items = zip(wishes, safe_controls.A, safe_controls.b, strict=True)
-            moving = [QpMotion(wish, Halfspaces(A, b)) for wish, A, b in items]
-        else:
-            kkt = solve_kkt(safe_controls, active_set(safe_controls, u, self.active_tolerance), C, d)
-            items = zip(wishes, kkt.free, kkt.offset, strict=True)
-            moving = [ObservedMotion(*of_robot) for of_robot in items]
-        return [motion if readable else None for motion, readable in zip(moving, known.tolist(), strict=True)]
-
     def _update_robot(self, i: int, dt: float, position: Array | None) -> Status:
         """Bring robot i's filter, mean and covariance to the time of the measurement."""
         kalman, motion = self.filters[i], self._motions[i]
-        drift = np.maximum(self.process_noise**2 * dt, (FLOOR * self._scale[i]) ** 2)
+        (walk,), drift = self._noises(np.array([dt]))
+        drift = drift[0, i]
         if kalman is not None and motion is not None and position is not None:
             n = len(position)
-            walk = max(self.motion_noise**2 * dt, (FLOOR * self.position_noise) ** 2)
             kalman.Q = np.diag(np.concatenate([np.full(n, walk), drift]))
             scale = np.concatenate([np.full(n, self.position_noise), self._scale[i]])
             try:
@@ -309,7 +330,7 @@ def _advance(kalman: UnscentedKalmanFilter, dt: float, motion: Motion, position:
     n, repairs = len(position), []
 
     def definite(covariance: Array) -> Array:
-        made, repaired = _make_definite(covariance, scale)
+        made, repaired = make_definite(covariance, scale)
         repairs.append(repaired)
         return made
 
@@ -322,17 +343,3 @@ def _advance(kalman: UnscentedKalmanFilter, dt: float, motion: Motion, position:
     kalman.update(position, n=n)
     kalman.P = definite(kalman.P)
     return any(repairs)
-
-
-def _make_definite(covariance: Array, scale: Array) -> tuple[Array, bool]:
-    """The symmetric part, with eigenvalues raised (in units of `scale`) if not definite, and whether they were."""
-    symmetric = (covariance + covariance.T) / 2
-    try:
-        np.linalg.cholesky(symmetric)
-    except np.linalg.LinAlgError:
-        values, axes = np.linalg.eigh(symmetric / np.outer(scale, scale))
-        axes = axes * scale[:, None]
-        floor = max(DEFINITE * np.abs(values).max(), FLOOR**2)
-        raised = (axes * values.clip(min=floor)) @ axes.T
-        return (raised + raised.T) / 2, True
-    return symmetric, False

@@ -89,20 +89,21 @@ class Measurement:
     @classmethod
     def of_team(
         cls,
-        t: float,
-        x: Float[Tensor, "bodies n"],
-        u: Float[Tensor, "bodies n"] | None = None,
+        t: float | Float[Tensor, "times"],
+        x: Float[Tensor, "*times bodies n"],
+        u: Float[Tensor, "*times bodies n"] | None = None,
         *,
         robots: Sequence[int] | None = None,
-        previous_u: Float[Tensor, "bodies n"] | None = None,
-        acceleration: Float[Tensor, "bodies n"] | None = None,
+        previous_u: Float[Tensor, "*times bodies n"] | None = None,
+        acceleration: Float[Tensor, "*times bodies n"] | None = None,
         radius: Float[Tensor, "bodies"] | None = None,
-        seen: Bool[Tensor, "bodies"] | None = None,
-        position_error: Float[Tensor, "bodies"] | None = None,
-        velocity_error: Float[Tensor, "bodies"] | None = None,
-        acceleration_error: Float[Tensor, "bodies"] | None = None,
+        seen: Bool[Tensor, "*times bodies"] | None = None,
+        position_error: Float[Tensor, "*times bodies"] | None = None,
+        velocity_error: Float[Tensor, "*times bodies"] | None = None,
+        acceleration_error: Float[Tensor, "*times bodies"] | None = None,
+        neighbour_error: Float[Tensor, "*times bodies"] | None = None,
     ) -> Measurement:
-        """The batch of the inferred `robots` among all bodies of a team.
+        """The batch of the inferred `robots` among all bodies of a team, at one time, or at several concatenated.
 
         Args:
             t: time [s].
@@ -116,50 +117,59 @@ class Measurement:
             position_error: bounds on the errors of `x` [m].
             velocity_error: bounds on the errors of `u` and `previous_u` [m/s].
             acceleration_error: bounds on the errors of `acceleration` [m/s2].
+            neighbour_error: other bounds than `velocity_error` where bodies are neighbours, and on arrival [m/s].
 
         Raises:
-            InputError: `x`, `u`, `acceleration` are not (bodies, n), or there are accelerations without velocities.
+            InputError: `x`, `u`, `acceleration` are not (bodies, n) for each time, or there are accelerations without
+                velocities.
         """
         x = torch.as_tensor(x).to(torch.float64)
-        if x.ndim != 2:
-            raise InputError("x", "positions (bodies, n)", tuple(x.shape))
+        times = torch.as_tensor(t).shape
+        if x.ndim != len(times) + 2 or x.shape[: len(times)] != times:
+            raise InputError("x", f"positions ({', '.join(map(str, (*times, 'bodies, n')))})", tuple(x.shape))
         if u is not None and u.shape != x.shape:
             raise InputError("u", f"velocities of shape {tuple(x.shape)}", tuple(u.shape))
         second_order = acceleration is not None
         if second_order and (u is None or acceleration.shape != x.shape):
             expected = f"accelerations of shape {tuple(x.shape)}, and velocities u"
             raise InputError("acceleration", expected, tuple(acceleration.shape))
-        count = x.shape[0]
-        slot = torch.arange(count, device=x.device)
+        axis, slot = len(times), torch.arange(x.shape[-2], device=x.device)
         index = slot if robots is None else slot[list(robots)]
-        seen = torch.ones_like(slot, dtype=torch.bool) if seen is None else seen
+        seen = slot.new_ones((*times, len(slot)), dtype=torch.bool) if seen is None else seen
+        is_another = slot != index.unsqueeze(-1)
+        neighbour_error = velocity_error if neighbour_error is None else neighbour_error
 
         def for_each_robot(of_bodies: Tensor | None) -> Tensor | None:
-            return None if of_bodies is None else of_bodies.to(torch.float64).expand(len(index), *of_bodies.shape)
+            if of_bodies is None:
+                return None
+            inner = of_bodies.shape[axis:]
+            return of_bodies.to(torch.float64).unsqueeze(axis).expand(*times, len(index), *inner).flatten(0, axis)
 
         def own(of_bodies: Tensor | None) -> Tensor | None:
-            return None if of_bodies is None else of_bodies.to(torch.float64)[index]
+            return None if of_bodies is None else of_bodies.to(torch.float64).index_select(axis, index).flatten(0, axis)
 
-        bodies = for_each_robot(x)
+        radius = None if radius is None else radius.expand(*times, -1)
+        positions, bodies = own(x), for_each_robot(x)
+        assert positions is not None
         assert bodies is not None
         return cls(
-            t=t,
-            x=x[index],
+            t=torch.as_tensor(t, dtype=torch.float64).repeat_interleave(len(index)) if times else t,
+            x=positions,
             u=own(acceleration if second_order else u),
             bodies=bodies,
-            present=seen & (slot != index.unsqueeze(-1)),
+            present=(seen.unsqueeze(axis) & is_another).flatten(0, axis),
             velocity=own(u if second_order else previous_u),
             body_velocities=for_each_robot(u),
             previous_body_velocities=for_each_robot(previous_u),
             body_accelerations=for_each_robot(acceleration),
             radius=own(radius),
             body_radii=for_each_robot(radius),
-            observed=seen[index],
+            observed=seen.index_select(axis, index).flatten(0, axis),
             position_error=own(position_error),
             body_position_error=for_each_robot(position_error),
             velocity_error=own(acceleration_error if second_order else velocity_error),
-            body_velocity_error=for_each_robot(velocity_error),
-            arrival_error=own(velocity_error),
+            body_velocity_error=for_each_robot(neighbour_error),
+            arrival_error=own(neighbour_error),
             body_acceleration_error=for_each_robot(acceleration_error),
         )
 

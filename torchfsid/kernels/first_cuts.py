@@ -1,0 +1,32 @@
+"""The search for the next sample, among many, that cuts a polygon."""
+
+from __future__ import annotations
+
+from typing import no_type_check
+
+import numpy as np
+
+from torchfsid.kernels.compiled import launcher
+from torchfsid.kernels.polygon import box_of, exceeded
+
+
+@launcher
+@no_type_check
+def first_cuts(vertices, count, reach, A, b, start):
+    """For each polygon k the first sample s >= start[k] of which a row (A[s, k], b[s, k]) cuts it. S if none does.
+
+    `A` (S, B, R, 2) and `b` (S, B, R) are the rows of S samples.
+    """
+    S, B, R = b.shape
+    found = np.full(B, S)
+    for k in range(B):
+        n = count[k]
+        box = box_of(vertices, k, n)
+        for s in range(start[k], S):
+            for r in range(R):
+                if exceeded(vertices, k, n, reach, box, A[s, k, r, 0], A[s, k, r, 1], b[s, k, r])[0] > 0:
+                    found[k] = s
+                    break
+            if found[k] < S:
+                break
+    return found

@@ -1,0 +1,174 @@
+"""Several samples of all robots, taken in at once: what does not depend on Theta is computed for all of them.
+
+The half-spaces of S samples are given. Most of them cut no set. Theta of a robot changes at some samples only, and a
+search finds the next of these for each robot (`kernels.first_cuts`; the support function in other dimensions). All
+robots are then cut together, each by the half-spaces of its own next sample, and the search goes on from there. So sets
+are cut in the order of time, exactly as if the samples had come one by one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchfsid.errors import InputError
+from torchfsid.halfspaces import Halfspaces, array
+from torchfsid.identification.by_robot import by_robot
+from torchfsid.identification.evidence import ObservationModel
+from torchfsid.kernels.first_cuts import first_cuts
+from torchfsid.observers.outliers import Levels, narrowed
+from torchfsid.robots.bounds import ErrorBounds
+from torchfsid.robots.measurement import Measurement
+from torchfsid.sets.around import reach
+from torchfsid.sets.feasible_set import FeasibleSet
+
+LARGEST_THETA = 1e9
+"""Larger than any parameter, to find out what depends on them."""
+
+FEW = 12
+"""Batches of sets that are joined at a time."""
+
+
+def depends_on_theta(model: ObservationModel, measurement: Measurement) -> bool:
+    """Does what a measurement says depend on the sets so far?
+
+    A bound on the drift of C theta + d is no smaller for larger theta. If it is the same for theta = 0 as for all theta
+    of the largest numbers, it does not depend on theta.
+    """
+    if model.task.saturation is not None or getattr(model.task, "uncertain", False):
+        return True
+    errors = ErrorBounds.of(measurement, model.noise)
+    if errors is None:
+        return False
+    nothing = measurement.x.new_zeros(len(measurement.x), len(model.task.parameter_names))
+    bounds = (model.task.drift(errors, size) for size in (nothing, torch.full_like(nothing, LARGEST_THETA)))
+    return not torch.equal(*bounds)
+
+
+def times_of(samples: Measurement, robots: int) -> Float[Tensor, "S"]:
+    """The times of S samples of these robots, concatenated in the order of time [s].
+
+    Raises:
+        InputError: the measurement is not such samples, or a sample has several times.
+    """
+    items = len(samples.x)
+    if samples.x.ndim == 2 and items == robots:
+        return torch.tensor([samples.time], dtype=torch.float64)
+    if samples.x.ndim != 2 or robots == 0 or items == 0 or items % robots != 0:
+        raise InputError("measurement", f"samples of {robots} robots, concatenated", tuple(samples.x.shape))
+    times = torch.as_tensor(samples.t, dtype=torch.float64).expand(items).unflatten(0, (-1, robots))
+    if not bool((times == times[:, :1]).all()):
+        raise InputError("measurement.t", "one time for all robots of a sample", "different times")
+    return times[:, 0]
+
+
+def one_by_one(samples: Measurement, robots: int) -> Iterator[Measurement]:
+    """The samples of a block, one after the other."""
+    if len(samples.x) == robots:
+        yield samples
+        return
+    for s, t in enumerate(times_of(samples, robots).tolist()):
+        yield replace(samples.select(slice(s * robots, (s + 1) * robots)), t=t)
+
+
+@dataclass
+class Course:
+    """Sets of B robots over S samples, as they are cut in the order of time.
+
+    Attributes:
+        levels: the sets so far, see `outliers`. The last one is Theta.
+        omega: the half-spaces of the samples (S*B, R), sample by sample.
+        t: the times of the samples [s].
+        parts: sets Theta, each a batch (k,): those before the samples, and those that followed.
+        which: for each sample and robot, the place of Theta after the sample in all `parts` one after the other.
+        explained: whether a parameter of Theta explains the sample.
+        lost: whether the sample emptied the last level.
+        proofs: for each (sample, robot) that did, what `proof` says of the empty set.
+    """
+
+    levels: Levels
+    omega: Halfspaces
+    t: Float[Tensor, "S"]
+    parts: list[FeasibleSet] = field(init=False)
+    which: Int[Tensor, "S B"] = field(init=False)
+    explained: Bool[Tensor, "S B"] = field(init=False)
+    lost: Bool[Tensor, "S B"] = field(init=False)
+    proofs: dict[tuple[int, int], tuple] = field(init=False, default_factory=dict)
+
+    def run(self, prior: FeasibleSet | None, proof: Callable[[FeasibleSet, int], tuple]) -> None:
+        """Cut the sets by all samples.
+
+        Args:
+            prior: what follows an empty set. None: the set as it was.
+            proof: called with the sets and the robot, where a set is empty.
+        """
+        samples, robots = len(self.t), self.levels[-1].batch_shape[0]
+        every, now = torch.arange(robots), torch.zeros(robots, dtype=torch.long)
+        self.lost = torch.zeros(samples, robots, dtype=torch.bool)
+        if samples == 1:  # no search: all robots are cut at once
+            explains, theta = self._cut(self.omega, self.t.expand(robots), now, prior, proof)
+            self.parts, self.which, self.explained = [theta], every.unsqueeze(0), explains.unsqueeze(0)
+            return
+        self.omega = self.omega.shortened()
+        self.parts, self.which = [self.levels[-1]], every.repeat(samples, 1)
+        self.explained = torch.ones_like(self.lost)
+        which, explained, known = self.which.numpy(), self.explained.numpy(), robots
+        while bool((cut := (now := self._next_cuts(now)) < samples).any()):
+            items = now.clamp(max=samples - 1) * robots + every
+            omega = self.omega.select(items).where(cut.unsqueeze(-1))
+            explains, theta = self._cut(omega, self.t[items // robots], now, prior, proof)
+            changed = cut.nonzero().flatten()
+            self.parts.append(theta.select(changed))
+            for robot, sample in zip(changed.tolist(), now[changed].tolist(), strict=True):
+                which[sample:, robot], explained[sample, robot], known = known, explains[robot], known + 1
+            now = torch.where(cut, now + 1, samples)
+
+    def _cut(
+        self, omega: Halfspaces, t: Tensor, now: Tensor, prior: FeasibleSet | None, proof: Callable
+    ) -> tuple[Bool[Tensor, "B"], FeasibleSet]:
+        """Cut the sets by the samples `now` of the robots. Returns whether they are explained, and Theta."""
+        (*below, theta), explained = narrowed(self.levels, omega, t)
+        if theta.any_empty:
+            for robot in theta.is_empty.nonzero().flatten().tolist():
+                self.lost[now[robot], robot] = True
+                self.proofs[int(now[robot]), robot] = proof(theta, robot)
+            theta = theta.where(~theta.is_empty, self.levels[-1] if prior is None else prior)
+        self.levels = (*below, theta)
+        return explained, theta
+
+    def _next_cuts(self, start: Int[Tensor, "B"]) -> Int[Tensor, "B"]:
+        """For each robot the first sample, from `start` on, of which some row cuts some level. S if there is none."""
+        samples = len(self.t)
+        found = torch.full_like(start, samples)
+        for level in self.levels:
+            since = torch.where(level.is_empty, samples, start)
+            found = torch.minimum(found, self._next_cut_of(level, since))
+        return found
+
+    def _next_cut_of(self, level: FeasibleSet, start: Int[Tensor, "B"]) -> Int[Tensor, "B"]:
+        samples, robots = self.which.shape
+        if level.dim == 2:
+            polygons = map(array, (level.body.corners, level.body.count, level.body.reach))
+            return torch.from_numpy(first_cuts(*polygons, *self._rows, array(start)))
+        rows, _ = by_robot(self.omega, 0.0, robots)
+        cuts = (reach(rows, level) > rows.b).unflatten(-1, (samples, -1)).any(-1)
+        cuts = cuts & (torch.arange(samples) >= start.unsqueeze(-1))
+        return torch.where(cuts.any(-1), cuts.int().argmax(-1), samples)
+
+    @cached_property
+    def _rows(self) -> tuple[np.ndarray, np.ndarray]:
+        shape = (*self.which.shape, -1)
+        return array(self.omega.A.unflatten(0, shape[:2])), array(self.omega.b.unflatten(0, shape[:2]))
+
+
+def joined(parts: Sequence[FeasibleSet]) -> FeasibleSet:
+    """Many batches (k,) of sets as one. Few are joined at a time, so that each set is copied a few times only."""
+    while len(parts) > 1:
+        parts = [FeasibleSet.concatenate(parts[k : k + FEW]) for k in range(0, len(parts), FEW)]
+    return parts[0]
