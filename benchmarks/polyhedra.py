@@ -234,7 +234,7 @@ def main(arguments: list[str]) -> None:
     print("\nround")
     for who, what in found.items():
         print(f"  {who:20s} clip {what['clip']:9.1f} us = {1e6 / what['clip']:9.0f} updates/s")
-    gain = {"polyhedron": unknown_gain(False, 200), "polytope": unknown_gain(True, 60)}
+    gain = {"polyhedron": unknown_gain(False, 200), "polytope": unknown_gain(True, 100)}
     results["unknown gain"] = gain
     print("\nunknown gain, one robot")
     for who, what in gain.items():
