@@ -9,8 +9,8 @@ redundant rows, merges to 32 facets and asks for volume, centroid and diameter. 
 
 Times are CPU times of one thread, per set and update. An update fails by an exception, by a truth outside of its rows,
 or by a volume that is off by more than 1 %, against the hull of the vertices in exact rationals. After a failure the
-peer starts again from the exact set. In `round` all rows touch a ball that shrinks: every row cuts, and a dozen facets
-are merged in each update. `unknown gain` observes one robot in the plane whose gain is unknown.
+peer starts again from the exact set. In `round` all rows nearly touch a ball that shrinks: every row cuts, and a dozen
+facets are merged in each update. `unknown gain` observes one robot in the plane whose gain is unknown.
 """
 
 from __future__ import annotations
@@ -234,7 +234,7 @@ def main(arguments: list[str]) -> None:
     print("\nround")
     for who, what in found.items():
         print(f"  {who:20s} clip {what['clip']:9.1f} us = {1e6 / what['clip']:9.0f} updates/s")
-    gain = {"polyhedron": unknown_gain(False, 200), "polytope": unknown_gain(True, 60)}
+    gain = {"polyhedron": unknown_gain(False, 200), "polytope": unknown_gain(True, 100)}
     results["unknown gain"] = gain
     print("\nunknown gain, one robot")
     for who, what in gain.items():
