@@ -212,7 +212,7 @@ class DeclaredLog:
         """The same log with another task, other barriers and another prior."""
         other = copy(self)
         other.config = config
-        other.task = config.task.build(self.log.bodies)
+        other.task = config.task.build(self.log.bodies, self.log.x.shape[-1])
         other.barriers = config.build_barriers(self.log.bodies, self._radius)
         other.prior = config.prior.build(len(self.robots))
         return other

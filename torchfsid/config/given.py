@@ -86,12 +86,6 @@ class GivenTask(_Given, _Task):
         return self.object.parameter_names[0].rpartition("_")[0]
 
     @property
-    def dimensions(self) -> tuple[int, ...]:
-        """What the task says. An own task that says nothing may be of either."""
-        said = getattr(self.object, "dimension", None)
-        return (2, 3) if said is None else (said,)
-
-    @property
     def is_clipped(self) -> bool:
         return getattr(self.object, "saturation", None) is not None
 
