@@ -16,7 +16,8 @@ from tests.bag_writer import odometry, write_bag
 from tests.logs import write_config, write_log
 from torchfsid.cli import main
 from torchfsid.commands.declared_log import DeclaredLog
-from torchfsid.commands.space_figure import shadow
+from torchfsid.commands.map_panel import Marks
+from torchfsid.commands.space_figure import seen_along, shadow, shadows
 from torchfsid.config.bags import BagConfig
 from torchfsid.config.documents import validate
 from torchfsid.config.motion_capture import LogConfig
@@ -184,6 +185,23 @@ def test_the_drones(name: str, tmp_path: Path) -> None:
     kept["obstacles"] = [body["name"] for body in declared["obstacles"]]
     written = read_log(tmp_path / "run" / "trajectory.csv")
     assert validate(kept, ObserveConfig, "cfg.yaml").dimension == written.x.shape[-1]
+
+
+def test_projections_of_regions() -> None:
+    """Places have shadows. Sets that are empty, or over a gain and a goal, have none, instead of a wrong one."""
+    box = [[x, y, z] for x in (0.0, 1.0) for y in (0.0, 2.0) for z in (0.0, 3.0)]
+    final = {
+        "place": {"vertices": box, "centroid": [0.5, 1.0, 1.5], "status": "ok"},
+        "empty": {"vertices": [], "centroid": [None] * 3, "status": "inconsistent"},
+        "gain": {"vertices": [[1.0, *corner] for corner in box], "centroid": [1.0, 0.5, 1.0, 1.5], "status": "ok"},
+    }
+    seen = shadows(final, (0, 2))
+    assert sorted(map(tuple, seen["place"]["vertices"])) == [(0, 0), (0, 3), (1, 0), (1, 3)]
+    assert seen["place"]["centroid"] == [0.5, 1.5]
+    assert all(len(seen[robot]["vertices"]) == 0 and None in seen[robot]["centroid"] for robot in ("empty", "gain"))
+    marks = seen_along(Marks(([0, 1, 2], [3, 4, 5]), {"place": [6, 7, 8], "gain": [1, 6, 7, 8]}), (0, 2))
+    assert marks.prior == ([0, 2], [3, 5])
+    assert marks.truth == {"place": [6, 8]}
 
 
 def test_shadows() -> None:

@@ -29,7 +29,10 @@ from torchfsid.identification.kkt import CASES
 
 CASE_GREYS = ("#ededed", "#c6c6c6", "#9a9a9a", "#5f5f5f", "#222222")
 CASE_WORDS = ("none", "one", "several, parallel", "two", "more")
-"""How many rows are active in each of `CASES`."""
+"""How many rows are active in each of `CASES`, in the plane."""
+
+CASE_WORDS_IN_SPACE = (*CASE_WORDS[:3], "several, independent", "dependent, not parallel")
+"""The same in space, where up to three rows are independent."""
 
 FLAT = 1.9
 """Width of a scene over its height from which on the map has the whole width of the page."""
@@ -171,7 +174,9 @@ def draw_sizes(axes: Axes, history: dict, final: dict[str, Any], clock: Clock, u
         axes.legend(title="robot", ncols=1 + count // 6, fontsize=8)
 
 
-def draw_cases(axes: Axes, history: dict[str, dict[str, np.ndarray]], clock: Clock) -> None:
+def draw_cases(
+    axes: Axes, history: dict[str, dict[str, np.ndarray]], clock: Clock, words: Sequence[str] = CASE_WORDS
+) -> None:
     cases = np.stack([thinned(of["case"]) for of in history.values()])
     t = thinned(next(iter(history.values()))["t"]) - clock.start
     ends = np.append(t, t[-1] + (t[-1] - t[-2] if len(t) > 1 else 1.0))
@@ -183,8 +188,8 @@ def draw_cases(axes: Axes, history: dict[str, dict[str, np.ndarray]], clock: Clo
     axes.set(xlabel=_time(clock), ylabel="robot")
     axes.set_title("Active rows (cases)", pad=16)
     handles = [
-        Patch(facecolor=grey, edgecolor="0.5", label=f"{case}: {words}")
-        for case, grey, words in zip(CASES, CASE_GREYS, CASE_WORDS, strict=True)
+        Patch(facecolor=grey, edgecolor="0.5", label=f"{case}: {told}")
+        for case, grey, told in zip(CASES, CASE_GREYS, words, strict=True)
     ]
     style = {"fontsize": 7.5, "handlelength": 1, "columnspacing": 0.9, "handletextpad": 0.4, "borderaxespad": 0.2}
     axes.legend(handles=handles, ncols=5, loc="lower left", bbox_to_anchor=(0.0, 1.0), **style)

@@ -17,7 +17,14 @@ from matplotlib.figure import Figure
 
 from torchfsid.commands.clock import Clock
 from torchfsid.commands.figure_style import render
-from torchfsid.commands.figures import draw_cases, draw_observation, draw_sizes, final_regions, history_of
+from torchfsid.commands.figures import (
+    CASE_WORDS_IN_SPACE,
+    draw_cases,
+    draw_observation,
+    draw_sizes,
+    final_regions,
+    history_of,
+)
 from torchfsid.commands.map_panel import Marks, draw_map, finish_map
 
 PLANES = ((0, 1), (0, 2), (1, 2))
@@ -69,7 +76,7 @@ def draw_in_space(
             axes.set_title(f"{axes.get_title(loc='left')}, along {'xyz'[3 - sum(plane)]}", pad=27)
             maps.append((axes, unfinished, of_plane))
         draw_sizes(figure.add_subplot(grid[1, 1]), history, final, clock, marks.unit)
-        draw_cases(figure.add_subplot(grid[2, :]), history, clock)
+        draw_cases(figure.add_subplot(grid[2, :]), history, clock, CASE_WORDS_IN_SPACE)
         figure.draw_without_rendering()
         if (layout := figure.get_layout_engine()) is not None:
             layout.execute(figure)  # again, because an equal aspect changes limits and ticks
