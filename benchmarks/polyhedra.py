@@ -9,7 +9,8 @@ redundant rows, merges to 32 facets and asks for volume, centroid and diameter. 
 
 Times are CPU times of one thread, per set and update. An update fails by an exception, by a truth outside of its rows,
 or by a volume that is off by more than 1 %, against the hull of the vertices in exact rationals. After a failure the
-peer starts again from the exact set. `unknown gain` observes one robot in the plane whose gain is unknown.
+peer starts again from the exact set. In `round` all rows nearly touch a ball that shrinks: every row cuts, and a dozen
+facets are merged in each update. `unknown gain` observes one robot in the plane whose gain is unknown.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from fractions import Fraction
 from itertools import islice
+from math import inf
 
 import numpy as np
 import torch
@@ -53,12 +55,15 @@ def truths(batch: int) -> np.ndarray:
 
 
 def workload(batch: int, width: float | None) -> Iterator[Rows]:
-    """A (batch, 12, 3) and b (batch, 12) for each update. If thin, two rows face each other from the second one on."""
+    """A (batch, 12, 3) and b (batch, 12) for each update. If thin, two rows face each other from the second one on. An
+    infinite width stands for `round`."""
     rng, truth, k = np.random.default_rng(1), truths(batch), 0
     across = rng.normal(size=(batch, 3))
     while True:
         A, distance = rng.normal(size=(batch, ROWS, 3)), rng.uniform(0.2, 1.0, (batch, ROWS)) * HALF * 0.98**k
-        if width is not None and k > 0:
+        if width == inf:
+            distance = rng.uniform(0.95, 1.0, (batch, ROWS)) * HALF / 2 * 0.98**k
+        elif width is not None and k > 0:
             A[:, 0] = across + width * rng.uniform(-0.25, 0.25, (batch, 3))
             A[:, 1] = width * rng.uniform(-0.25, 0.25, (batch, 3)) - across
             distance[:, :2] = rng.uniform(0.25, 0.5, (batch, 2)) * width
@@ -221,7 +226,15 @@ def main(arguments: list[str]) -> None:
             what = found[peer]
             failed = f"failed {what['failed']} of {what['of']} {what['failures'] or ''}"
             print(f"  one set, {peer:11s} {what['microseconds'] or np.nan:9.1f} us, {failed}")
-    gain = {"polyhedron": unknown_gain(False, 200), "polytope": unknown_gain(True, 60)}
+    rows, truth = list(islice(workload(options.batch, inf), options.updates)), truths(options.batch)
+    few = [(A[:2], b[:2]) for A, b in rows[:10]]
+    found = {"batch": batch_of(prior(options.batch), rows, truth)}
+    found["batch, polytope"] = batch_of(prior(2, numpy=True), few, truth[:2])
+    results["workloads"]["round"] = found
+    print("\nround")
+    for who, what in found.items():
+        print(f"  {who:20s} clip {what['clip']:9.1f} us = {1e6 / what['clip']:9.0f} updates/s")
+    gain = {"polyhedron": unknown_gain(False, 200), "polytope": unknown_gain(True, 100)}
     results["unknown gain"] = gain
     print("\nunknown gain, one robot")
     for who, what in gain.items():

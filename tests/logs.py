@@ -18,7 +18,8 @@ def write_log(path: Path, run: Trajectory, bodies: Sequence[str], errors: Tensor
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         radius = [[] for _ in bodies] if run.radius is None else run.radius.unsqueeze(-1).tolist()
-        names = ["t", "robot", "x", "y", "vx", "vy", "ax", "ay"][: 2 + 2 * len(columns)]
+        axes = "xyz"[: run.x.shape[-1]]
+        names = ["t", "robot", *(f"{of}{axis}" for of in ("", "v", "a")[: len(columns)] for axis in axes)]
         writer.writerow([*names, *(["radius"] if run.radius is not None else [])])
         for k, t in enumerate(run.t.tolist()):
             for j, body in enumerate(bodies):

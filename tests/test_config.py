@@ -131,7 +131,9 @@ def test_every_kind_of_task(text):
     config = validate({"task": yaml.safe_load(text)}, Task, "cfg.yaml").task
     built = config.build(BODIES)
     assert built == TASKS[text]
-    assert config.parameters == len(built.parameter_names)
+    assert config.parameters(2) == len(built.parameter_names)
+    if 3 in config.dimensions:
+        assert config.parameters(3) == len(config.build(BODIES, 3).parameter_names)
 
 
 BARRIERS = {

@@ -80,7 +80,7 @@ def test_the_first_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: 
         assert main(command[1:]) == 0
     said = capsys.readouterr().out
     assert "velocity >= 0.00399 m/s" in said
-    assert "no shift by 1 or 2 samples fits better" in said
+    assert "no shift by 1 or 2 samples fits much better" in said
 
 
 def test_every_public_name_is_described() -> None:

@@ -224,11 +224,9 @@ def test_compiled_code_is_used_only_where_it_can_be() -> None:
     with torch.no_grad():
         of(learned, True)
     cube = FeasibleSet.from_box(*torch.tensor([[[-1.0] * 3], [[1.0] * 3]], dtype=torch.float64))
-    with pytest.raises(InputError, match="compiled"):
-        SetMembershipObserver(UnknownGainGoalTask(), [], cube, noise=NoiseBound(0.01), compiled=True)
-    unknown_gain = ObservationModel(UnknownGainGoalTask(), model.barriers, noise=model.noise)
-    with pytest.raises(InputError, match="planar"):
-        evidence(unknown_gain, cube, Measurement.of_team(0.0, x, x), True)
+    both_unknown = ObservationModel(UnknownGainGoalTask(saturation=SATURATIONS[0]), model.barriers, noise=model.noise)
+    with pytest.raises(InputError, match="clipped"):
+        evidence(both_unknown, cube, Measurement.of_team(0.0, x, x), True)
     clipped = ObservationModel(GoalTask(0.9, saturation=SATURATIONS[0]), model.barriers, noise=model.noise)
     corner = torch.ones(1, 2, dtype=torch.float64).requires_grad_()
     with pytest.raises(InputError, match="gradients"):

@@ -9,7 +9,7 @@ from torch import Tensor
 
 import torchfsid as fsid
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.identification.kkt import outward_normals
+from torchfsid.identification.normals import outward_normals
 from torchfsid.identification.saturation import unclipped
 from torchfsid.robots.tasks import Saturation
 from torchfsid.tolerances import NORMALS

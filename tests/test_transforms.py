@@ -147,7 +147,7 @@ def refusals() -> dict[str, dict]:
         r"frame 'base_link': expected a unit quaternion, got \(0\.0, 0\.0, 0\.0, 0\.0\)": {
             "/tf": [transforms(k * MS, {"base_link": (k, 0)}, "map", (0.0,) * 4) for k in range(3)]
         },
-        r"frame 'base_link': robots in the plane only, but the height changes from 0 to 0\.6 m": {
+        r"frame 'base_link': robots in the plane \(a prior of two entries\), but the height changes from 0 to 0\.6 m": {
             "/tf": [transforms(k * MS, {"base_link": (k, 0, 0.3 * k)}, "map") for k in range(3)]
         },
         r"no transforms lead from 'base_link' to 'map', they end at 'base_link'; there are \['base_link', 'odom'\]": {

@@ -55,7 +55,9 @@ if TYPE_CHECKING:
     from torchfsid.robots.bounds import ErrorBounds as ErrorBounds
     from torchfsid.robots.bounds import NoiseBound as NoiseBound
     from torchfsid.robots.bounds import RowErrors as RowErrors
+    from torchfsid.robots.buffered_voronoi import BufferedVoronoi as BufferedVoronoi
     from torchfsid.robots.controller import CbfQpController as CbfQpController
+    from torchfsid.robots.ellipsoid import Ellipsoid as Ellipsoid
     from torchfsid.robots.measurement import Measurement as Measurement
     from torchfsid.robots.neighbours import nearest_bodies as nearest_bodies
     from torchfsid.robots.orca import Orca as Orca
@@ -100,7 +102,9 @@ _HOME = {
     "robots.avoidance": ["ClassK", "CollisionAvoidance"],
     "robots.barriers": ["Arena", "Barrier", "SpeedBox", "SpeedPolygon"],
     "robots.bounds": ["ErrorBounds", "NoiseBound", "RowErrors"],
+    "robots.buffered_voronoi": ["BufferedVoronoi"],
     "robots.controller": ["CbfQpController"],
+    "robots.ellipsoid": ["Ellipsoid"],
     "robots.measurement": ["Measurement"],
     "robots.neighbours": ["nearest_bodies"],
     "robots.orca": ["Orca", "OrcaController"],

@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 from experiments.figures import drawing
 from experiments.figures.style import SET_NAMES, team_colours
 from experiments.runs.config import SceneConfig
-from experiments.runs.lengths import lengths
+from experiments.runs.lengths import ROOT_NAMES, lengths
 from experiments.runs.saved import Results
 
 PANELS = (
@@ -65,12 +65,12 @@ def _draw_snapshot(axes: Axes, results: Results, config: SceneConfig, k: int) ->
 
 def draw_comparison(results: Results, config: SceneConfig) -> Figure:
     """Lengths over time, one colour per robot: each kind of set, the filter, the hybrid."""
-    measures, colours = lengths(results), team_colours(config)
+    measures, colours, root = lengths(results), team_colours(config), ROOT_NAMES[config.dimension]
     panels = [panel for panel in PANELS if panel[0] in (*config.sets, *measures)]
     figure = Figure(figsize=(2.75 * len(panels), 3.5), layout="constrained")
     all_axes = figure.subplots(1, len(panels), sharex=True, sharey=True)
     for axes, (name, title) in zip(all_axes, panels, strict=True):
-        main = drawing.positive(measures[name] if name in measures else measures[f"{name} sqrt_area"])
+        main = drawing.positive(measures[name] if name in measures else measures[f"{name} {root}"])
         for i, colour in enumerate(colours):
             axes.semilogy(results.t, main[:, i], color=colour, lw=1.5)
             if name not in measures:
@@ -84,6 +84,10 @@ def draw_comparison(results: Results, config: SceneConfig) -> Figure:
     drawing.headline(figure, f"{config.title}, dotted: the snapshots")
     robots = [Line2D([], [], color=colour, lw=1.8) for colour in colours]
     looks = [Line2D([], [], color="0.4", lw=1.5), Line2D([], [], color="0.4", lw=1.0, ls=(0, (4, 1.5)))]
-    labels = [*(robot.name for robot in config.robots), "√area, error", "diameter"]
+    labels = [
+        *(robot.name for robot in config.robots),
+        f"{'√area' if config.dimension == 2 else '∛volume'}, error",
+        "diameter",
+    ]
     figure.legend([*robots, *looks], labels, loc="outside lower center", ncols=min(len(labels), 10))
     return figure

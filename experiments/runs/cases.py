@@ -45,7 +45,8 @@ def record_cases(config: CasesConfig) -> Recording:
     """All cases as one batch of robots, each among its own bodies."""
     count = len(config.cases)
     goals, start = (torch.tensor(at, dtype=torch.float64).expand(count, 2) for at in (config.goal, config.start))
-    controller = CbfQpController(config.task.build([]), [barrier.build([]) for barrier in config.barriers])
+    task = config.task.build([], config.dimension)
+    controller = CbfQpController(task, [barrier.build([]) for barrier in config.barriers])
     places = [_places(case, config) for case in config.cases]
     offsets, radii, present = (torch.stack(parts) for parts in zip(*places, strict=True))
     radius = torch.full((count,), config.radius, dtype=torch.float64)

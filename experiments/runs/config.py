@@ -14,10 +14,11 @@ from pydantic import Field, model_validator
 
 from torchfsid.config.avoidance import AvoidanceConfig
 from torchfsid.config.barriers import BarrierConfig
+from torchfsid.config.dimensions import dimensions_of, require_one_dimension
 from torchfsid.config.documents import Strict, wrong
 from torchfsid.config.observe import AnyNoiseConfig, Dynamics, require_one_order
 from torchfsid.config.observers import PriorConfig, UkfConfig
-from torchfsid.config.quantities import BodyName, NonNegative, Number, PlanarVector, Positive, known
+from torchfsid.config.quantities import BodyName, NonNegative, Number, Place, PlanarVector, Positive, known
 from torchfsid.config.tasks import GoalConfig
 from torchfsid.config.unknown_numbers import unknown_numbers
 
@@ -43,8 +44,8 @@ class RobotConfig(Strict):
     """
 
     name: BodyName
-    start: PlanarVector
-    goal: PlanarVector
+    start: Place
+    goal: Place
 
 
 class ObstacleConfig(Strict):
@@ -56,7 +57,7 @@ class ObstacleConfig(Strict):
     """
 
     name: BodyName
-    position: PlanarVector
+    position: Place
 
 
 class MeasurementNoiseConfig(Strict):
@@ -135,6 +136,11 @@ class ExperimentConfig(Strict):
         return round(self.duration / self.dt)
 
     @property
+    def dimension(self) -> int:
+        """Are the robots in the plane (2) or in space (3)?"""
+        return dimensions_of(self.task, self.prior)[0]
+
+    @property
     def sets(self) -> tuple[SetKind, ...]:
         """The kinds of set that can be computed. The paper's needs exact rows and a nominal control without limits."""
         exact = not self.task.is_clipped and not any(barrier.uncertain for barrier in self.barriers)
@@ -160,8 +166,7 @@ class ExperimentConfig(Strict):
             )
         if self.set not in self.sets:
             raise wrong("critical_region needs exact rows and no clipped nominal control, take inverse_optimal", "set")
-        if len(self.prior.lower) != self.task.parameters:
-            raise wrong(f"a goal has {self.task.parameters} entries, lower has {len(self.prior.lower)}", "prior")
+        require_one_dimension((self.dimension,), self.barriers)
         require_steps(self.duration, self.dt)
         return self
 
@@ -208,6 +213,13 @@ class SceneConfig(ExperimentConfig):
         names = self.bodies
         if repeated := [name for i, name in enumerate(names) if name in names[:i]]:
             raise wrong(f"two bodies are called {repeated[0]!r}", "robots, obstacles")
+        places = {
+            f"robots[{i}].{name}": getattr(of, name) for i, of in enumerate(self.robots) for name in ("start", "goal")
+        }
+        places |= {f"obstacles[{i}].position": of.position for i, of in enumerate(self.obstacles)}
+        for path, place in places.items():
+            if len(place) != self.dimension:
+                raise wrong(f"expected {self.dimension} entries as in the prior, got {list(place)}", path)
         for i, robot in enumerate(self.robots):
             self._require_in_prior(robot.goal, f"robots[{i}].goal")
         if self.radius is None and any(barrier.uses_radius for barrier in self.barriers):
@@ -216,6 +228,8 @@ class SceneConfig(ExperimentConfig):
         noise = self.measurement_noise
         if self.dynamics == "single_integrator" and noise.acceleration > 0:
             raise wrong("needs dynamics: double_integrator", "measurement_noise.acceleration")
+        if self.dimension == 3 and noise.shape == "adversarial":
+            raise wrong("the adversary knows robots in the plane only", "measurement_noise.shape")
         if self.dynamics == "double_integrator" and noise.shape == "adversarial":
             raise wrong("the adversary knows single integrators only", "measurement_noise.shape")
         if self.expected and len(self.robots) > 1:

@@ -33,7 +33,8 @@ def measure(true: Trajectory, config: SceneConfig) -> Trajectory:
     if noise.shape == "adversarial":
         return _worst(true, config, random)
     of_all = (len(true.t), robots)
-    draw, shape = (in_disc, of_all) if noise.shape == "uniform" else (_on_circle, (robots,))
+    (inside, surface) = (in_disc, _on_circle) if true.x.shape[-1] == 2 else (_in_ball, _on_sphere)
+    draw, shape = (inside, of_all) if noise.shape == "uniform" else (surface, (robots,))
     x, u = true.x.clone(), true.u.clone()
     x[:, :robots] += draw(random, noise.position, shape)
     if true.velocity is None:
@@ -53,7 +54,7 @@ def _worst(true: Trajectory, config: SceneConfig, random: np.random.Generator) -
     # A length of zero needs no direction.
     turns = torch.cartesian_prod(compass if noise.position else compass[:1], compass if noise.velocity else compass[:1])
     candidates = goals.repeat(len(turns), 1)
-    model = ObservationModel(config.task.build(config.bodies), barriers, noise=config.noise.build())
+    model = ObservationModel(config.task.build(config.bodies, config.dimension), barriers, noise=config.noise.build())
     prior = config.prior.build(len(candidates))
     x, u = true.x.clone(), true.u.clone()
     x[0, :robots] += _on_circle(random, noise.position, (robots,))
@@ -94,6 +95,17 @@ def in_disc(random: np.random.Generator, radius: float, shape: tuple[int, ...]) 
 
 def _on_circle(random: np.random.Generator, radius: float, shape: tuple[int, ...]) -> Float[Tensor, "*shape 2"]:
     return radius * _towards(torch.from_numpy(random.uniform(0, 2 * np.pi, size=shape)))
+
+
+def _in_ball(random: np.random.Generator, radius: float, shape: tuple[int, ...]) -> Float[Tensor, "*shape 3"]:
+    """Points uniformly distributed in a ball."""
+    share = torch.from_numpy(np.cbrt(random.uniform(size=(*shape, 1))))
+    return share * _on_sphere(random, radius, shape)
+
+
+def _on_sphere(random: np.random.Generator, radius: float, shape: tuple[int, ...]) -> Float[Tensor, "*shape 3"]:
+    towards = random.normal(size=(*shape, 3))
+    return torch.from_numpy(radius * towards / np.linalg.norm(towards, axis=-1, keepdims=True))
 
 
 def _towards(angle: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape 2"]:

@@ -33,7 +33,7 @@ class Recording:
     """
 
     robots: list[str]
-    goals: Float[Tensor, "B 2"]
+    goals: Float[Tensor, "B n"]
     task: Task
     barriers: list[Barrier]
     labels: list[str]
@@ -55,7 +55,7 @@ class SimulatedScene:
         """The recording of the scene's robots."""
         return Recording(
             robots=[robot.name for robot in self.config.robots],
-            goals=_points([robot.goal for robot in self.config.robots]),
+            goals=_points([robot.goal for robot in self.config.robots], self.config.dimension),
             task=self.task,
             barriers=self.barriers,
             labels=[label for barrier in self.barriers for label in barrier.labels(self.config.bodies)],
@@ -66,21 +66,21 @@ class SimulatedScene:
 
 def simulate_scene(config: SceneConfig) -> SimulatedScene:
     """Run the scene's robots from rest in closed loop, and measure them with the configured errors."""
-    task = config.task.build(config.bodies)
+    task = config.task.build(config.bodies, config.dimension)
     barriers: list[Barrier] = [barrier.build(config.bodies) for barrier in config.barriers]
-    start = _points([robot.start for robot in config.robots])
+    start = _points([robot.start for robot in config.robots], config.dimension)
     true = simulate(
         CbfQpController(task, barriers),
-        _points([robot.goal for robot in config.robots]),
+        _points([robot.goal for robot in config.robots], config.dimension),
         start,
         dt=config.dt,
         steps=config.steps,
         velocity=torch.zeros_like(start) if config.dynamics == "double_integrator" else None,
-        obstacles=_points([obstacle.position for obstacle in config.obstacles]),
+        obstacles=_points([obstacle.position for obstacle in config.obstacles], config.dimension),
         radius=None if config.radius is None else torch.full((len(config.bodies),), config.radius, dtype=torch.float64),
     )
     return SimulatedScene(config, task, barriers, true, measure(true, config))
 
 
-def _points(points: list[tuple[float, ...]]) -> Float[Tensor, "points 2"]:
-    return torch.tensor(points, dtype=torch.float64).reshape(-1, 2)
+def _points(points: list[tuple[float, ...]], n: int) -> Float[Tensor, "points n"]:
+    return torch.tensor(points, dtype=torch.float64).reshape(-1, n)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from experiments.results import Columns, read_columns, read_json, reading, require_length
-from experiments.runs.config import CasesConfig, SceneConfig
+from experiments.runs.config import CasesConfig, ExperimentConfig, SceneConfig
 
 
 @dataclass(frozen=True)
@@ -22,7 +21,7 @@ class Region:
     Attributes:
         active: names of the active rows.
         vertices: vertices of each kind of set [m].
-        rows: unit rows (a_x, a_y, b) over the control.
+        rows: unit rows (a, b) over the control.
         u: the control [m/s].
         nominal: the nominal control [m/s].
     """
@@ -90,18 +89,18 @@ class Results:
         """The regions by sample, then robot."""
         path, count = self.folder / "regions.jsonl", len(self.robots)
         with reading(path), path.open(encoding="utf-8") as file:
-            lines = [_region(json.loads(line), self.config.sets) for line in file]
+            lines = [_region(json.loads(line), self.config) for line in file]
         require_length(path, len(lines), count * len(self.t))
         return [lines[i : i + count] for i in range(0, len(lines), count)]
 
     @cached_property
     def paths(self) -> dict[str, np.ndarray]:
-        """The positions of every body: (times, 2) [m]."""
+        """The positions of every body: (times, n) [m]."""
         assert isinstance(self.config, SceneConfig)
         table, paths = read_columns(self.folder / "trajectory.csv"), {}
         for body in self.config.bodies:
             of_body = table.where(robot=body).of_length(len(self.t))
-            paths[body] = np.stack([of_body.numbers("x"), of_body.numbers("y")], axis=-1)
+            paths[body] = np.stack([of_body.numbers(axis) for axis in "xyz"[: self.config.dimension]], axis=-1)
         return paths
 
     @cached_property
@@ -117,11 +116,12 @@ class Results:
         return column.reshape(-1, len(self.robots))
 
 
-def _region(line: dict[str, Any], kinds: Iterable[str]) -> Region:
+def _region(line: dict[str, Any], config: ExperimentConfig) -> Region:
+    n = config.dimension
     return Region(
         active=[str(name) for name in line["active"]],
-        vertices={kind: np.array(line[kind], dtype=float).reshape(-1, 2) for kind in kinds},
-        rows=np.array(line["rows"], dtype=float).reshape(-1, 3),
-        u=np.array(line["u"], dtype=float).reshape(2),
-        nominal=np.array(line["nominal"], dtype=float).reshape(2),
+        vertices={kind: np.array(line[kind], dtype=float).reshape(-1, n) for kind in config.sets},
+        rows=np.array(line["rows"], dtype=float).reshape(-1, n + 1),
+        u=np.array(line["u"], dtype=float).reshape(n),
+        nominal=np.array(line["nominal"], dtype=float).reshape(n),
     )

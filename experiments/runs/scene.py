@@ -29,9 +29,10 @@ def run_scene(config: SceneConfig, out: Path, track: Track) -> dict[str, Any]:
 
 def write_trajectory(path: Path, bodies: list[str], measured: Trajectory) -> None:
     """Write the measured trajectory with all digits, so that an observer of the log sees the same numbers."""
-    columns, names = [measured.x], ["x", "y", "vx", "vy"]
+    axes = "xyz"[: measured.x.shape[-1]]
+    columns, names = [measured.x], [*axes, *(f"v{axis}" for axis in axes)]
     if measured.velocity is not None:
-        columns, names = [*columns, measured.velocity], [*names, "ax", "ay"]
+        columns, names = [*columns, measured.velocity], [*names, *(f"a{axis}" for axis in axes)]
     columns.append(measured.u)
     if measured.radius is not None:
         columns, names = [*columns, measured.radius.expand(measured.x.shape[:-1]).unsqueeze(-1)], [*names, "radius"]

@@ -42,7 +42,8 @@ def run_swarm(config: SwarmConfig, out: Path, track: Track) -> dict[str, Any]:
     began = time.perf_counter()
     placing, measuring = map(np.random.default_rng, np.random.SeedSequence(config.seed).spawn(2))
     starts, goals = place(config, placing)
-    controller = CbfQpController(config.task.build([]), [barrier.build([]) for barrier in config.barriers])
+    task = config.task.build([], config.dimension)
+    controller = CbfQpController(task, [barrier.build([]) for barrier in config.barriers])
     observer = build_sets(config, config.set, controller.task, controller.barriers, config.robots)
     lost, infeasible, closest = torch.zeros(config.robots, dtype=torch.bool), 0, float("inf")
     shown = {round(t / config.dt) for t in config.snapshots}

@@ -10,9 +10,9 @@ from rich.markup import escape
 from experiments.tables import table
 
 ESTIMATORS = {"ukf": "UKF error", "hybrid": "hybrid error"} | {
-    f"{kind} {measure}": f"{name} {measure.replace('sqrt_', '√')}"
+    f"{kind} {measure}": f"{name} {measure.replace('sqrt_', '√').replace('cbrt_', '∛')}"
     for kind, name in (("critical_region", "paper's region"), ("inverse_optimal", "inverse-optimal"))
-    for measure in ("sqrt_area", "diameter", "centroid", "centre")
+    for measure in ("sqrt_area", "cbrt_volume", "diameter", "centroid", "centre")
 }
 
 

@@ -1,7 +1,8 @@
 """The record of one run of a sweep: a table row, and sizes and errors at some times.
 
-Sizes are the square root of the area, the diameter, and the distances of point estimates from the goal [m]. A set is
-lost from the first sample at which it does not hold the truth. It is lost in silence if its status ends as `ok`.
+Sizes are the square root of the area (in space the cube root of the volume), the diameter, and the distances of point
+estimates from the goal [m]. A set is lost from the first sample at which it does not hold the truth. It is lost in
+silence if its status ends as `ok`.
 """
 
 from __future__ import annotations
@@ -94,7 +95,7 @@ def _sizes(estimate: HybridEstimate, sets: dict[str, SetEstimate], goals: Tensor
     sizes = {}
     for kind, of_kind in sets.items():
         theta = of_kind.feasible_set
-        sizes[f"{kind}_sqrt_area"] = theta.volume().sqrt()
+        sizes[f"{kind}_sqrt_area"] = theta.volume().sqrt() if theta.dim == 2 else theta.volume() ** (1 / 3)
         sizes[f"{kind}_diameter"] = theta.diameter()
         sizes[f"{kind}_centroid_error"] = (of_kind.theta - goals).norm(dim=-1)
     sizes["ukf_error"] = (estimate.ukf_estimate.theta - goals).norm(dim=-1)

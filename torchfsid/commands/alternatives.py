@@ -72,7 +72,7 @@ class Alternative:
         if self.key.endswith(tuple(WORDS)) or self.declared == "none":
             return change
         low, high = float(self.value) / 2, float(self.value) * 2
-        return f"{change} (torchfsid check --scan {self.key}={low:.2g}:{high:.2g} shows more)"
+        return f"{change} (torchfsid check --scan {self.key}={low:.3g}:{high:.3g} shows more)"
 
 
 def with_change(config: ObserveConfig, key: str, value: str) -> ObserveConfig:

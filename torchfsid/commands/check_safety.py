@@ -123,8 +123,8 @@ def check_safety(declared: DeclaredLog) -> SafetyCheck | None:
         declared: the log and its model.
 
     Returns:
-        None if there is not exactly one such barrier, if bodies have distances of their own, or if sets are reset or
-        are critical regions.
+        None if there is not exactly one such barrier, if bodies have distances of their own or are ellipsoids, or if
+        sets are reset or are critical regions.
     """
     config = declared.config
     places = [i for i, barrier in enumerate(config.barriers) if isinstance(barrier, AvoidanceConfig)]
@@ -132,7 +132,7 @@ def check_safety(declared: DeclaredLog) -> SafetyCheck | None:
         return None
     barrier = config.barriers[places[0]]
     assert isinstance(barrier, AvoidanceConfig)
-    if barrier.safety_distances:
+    if barrier.safety_distances or barrier.ellipsoid is not None:
         return None
     radius = None if declared.log.radius is None else declared.log.radius.tolist()
     stated = barrier.build_unknown(radius)

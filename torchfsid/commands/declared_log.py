@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torchfsid.commands.clock import Clock
 from torchfsid.commands.judged_bound import SUSPECTS, JudgedBound
 from torchfsid.commands.where_to_look import where_to_look
+from torchfsid.config.dimensions import WORDS
 from torchfsid.config.observe import ObserveConfig
 from torchfsid.config.quantities import require_body
 from torchfsid.config.unknown_numbers import replaced
@@ -63,7 +64,7 @@ class DeclaredLog:
         prior: the prior sets of the robots.
 
     Raises:
-        ConfigError: the model needs something that the log does not have (a body, velocities, radii, planar positions).
+        ConfigError: the model needs something that the log does not have (a body, velocities, radii, positions z).
     """
 
     config: ObserveConfig
@@ -76,8 +77,10 @@ class DeclaredLog:
 
     def __post_init__(self) -> None:
         config = self.config
-        if self.log.x.shape[-1] != 2:
-            raise ConfigError("task: planar controllers only, but the log has a column z")
+        if self.log.x.shape[-1] not in config.dimensions:
+            told = f"prior: {len(config.prior.lower)} entries for a task {config.task.kind!r}"
+            there = "has positions z" if config.dimension == 2 else "has no positions z"
+            raise ConfigError(f"{told}: robots {WORDS[config.dimension]}, but the log {there}")
         if config.is_second_order:
             self._require_accelerations()
         elif config.velocity == "logged" and self.log.u is None:
@@ -103,7 +106,7 @@ class DeclaredLog:
         self.robots = config.robots(self.log.bodies)
         for robot in config.truth or {}:
             require_body(f"truth.{robot}", robot, self.robots)
-        self.task = config.task.build(self.log.bodies)
+        self.task = config.task.build(self.log.bodies, self.log.x.shape[-1])
         self.barriers = config.build_barriers(self.log.bodies, self._radius)
         self.prior = config.prior.build(len(self.robots))
         if config.ukf is not False:
@@ -216,7 +219,7 @@ class DeclaredLog:
         """The same log with another task, other barriers and another prior."""
         other = copy(self)
         other.config = config
-        other.task = config.task.build(self.log.bodies)
+        other.task = config.task.build(self.log.bodies, self.log.x.shape[-1])
         other.barriers = config.build_barriers(self.log.bodies, self._radius)
         other.prior = config.prior.build(len(self.robots))
         return other
@@ -226,7 +229,7 @@ class DeclaredLog:
         other = copy(self)
         for number, interval in zip(self.config.unknown_numbers, intervals, strict=True):
             other.config = replaced(other.config, number.path, interval)
-        other.task = other.config.task.build(self.log.bodies)
+        other.task = other.config.task.build(self.log.bodies, self.log.x.shape[-1])
         other.barriers = other.config.build_barriers(self.log.bodies, self._radius)
         return other
 

@@ -28,8 +28,11 @@ from torchfsid.errors import FigureError, one_line
 from torchfsid.identification.kkt import CASES
 
 CASE_GREYS = ("#ededed", "#c6c6c6", "#9a9a9a", "#5f5f5f", "#222222")
-CASE_WORDS = ("none", "one", "several, parallel", "two", "three or more")
-"""How many rows are active in each of `CASES`."""
+CASE_WORDS = ("none", "one", "several, parallel", "two", "more")
+"""How many rows are active in each of `CASES`, in the plane."""
+
+CASE_WORDS_IN_SPACE = (*CASE_WORDS[:3], "several, independent", "dependent, not parallel")
+"""The same in space, where up to three rows are independent."""
 
 FLAT = 1.9
 """Width of a scene over its height from which on the map has the whole width of the page."""
@@ -51,8 +54,8 @@ def draw_observation(
         FigureError: a file is missing or damaged, or matplotlib fails.
         OSError: a figure cannot be written.
     """
-    final = _regions(out / "regions.json")
-    history = _history(out / "estimates.csv", final)
+    final = final_regions(out / "regions.json")
+    history = history_of(out / "estimates.csv", final)
     marks, clock = marks or Marks(), Clock.of(float(next(iter(history.values()))["t"][0]))
     width, height = extent(final, x[..., :2], seen, marks)
     is_flat = width > FLAT * height
@@ -70,9 +73,9 @@ def draw_observation(
         map_axes = figure.add_subplot(places[0])
         unfinished = draw_map(map_axes, final, x[..., :2], seen, bodies, marks)
         sizes = figure.add_subplot(places[1])
-        _draw_sizes(sizes, history, final, clock, marks.unit)
+        draw_sizes(sizes, history, final, clock, marks.unit)
         cases = figure.add_subplot(places[2], sharex=sizes)
-        _draw_cases(cases, history, clock)
+        draw_cases(cases, history, clock)
         if not is_flat:
             sizes.tick_params(labelbottom=False)
             sizes.set_xlabel("")
@@ -85,7 +88,7 @@ def draw_observation(
     return render(out / "regions", size, draw)
 
 
-def _regions(path: Path) -> dict[str, Any]:
+def final_regions(path: Path) -> dict[str, Any]:
     """The robots' final sets."""
     try:
         robots = json.loads(path.read_text(encoding="utf-8"))["robots"]
@@ -102,7 +105,7 @@ def _regions(path: Path) -> dict[str, Any]:
         raise FigureError(f"{path}: missing or damaged: {one_line(error)}") from error
 
 
-def _history(path: Path, robots: Collection[str]) -> dict[str, dict[str, np.ndarray]]:
+def history_of(path: Path, robots: Collection[str]) -> dict[str, dict[str, np.ndarray]]:
     """For each robot: times [s], diameters (NaN if the set is empty) and indices of cases (NaN if not measured).
 
     The times are thinned while they are read: what is not drawn is not parsed.
@@ -134,7 +137,7 @@ def _history(path: Path, robots: Collection[str]) -> dict[str, dict[str, np.ndar
     }
 
 
-def _draw_sizes(axes: Axes, history: dict, final: dict[str, Any], clock: Clock, unit: str) -> None:
+def draw_sizes(axes: Axes, history: dict, final: dict[str, Any], clock: Clock, unit: str) -> None:
     count = len(history)
     for i, (robot, of) in enumerate(history.items()):
         t, diameter = thinned(of["t"]) - clock.start, thinned(of["diameter"])
@@ -171,7 +174,9 @@ def _draw_sizes(axes: Axes, history: dict, final: dict[str, Any], clock: Clock, 
         axes.legend(title="robot", ncols=1 + count // 6, fontsize=8)
 
 
-def _draw_cases(axes: Axes, history: dict[str, dict[str, np.ndarray]], clock: Clock) -> None:
+def draw_cases(
+    axes: Axes, history: dict[str, dict[str, np.ndarray]], clock: Clock, words: Sequence[str] = CASE_WORDS
+) -> None:
     cases = np.stack([thinned(of["case"]) for of in history.values()])
     t = thinned(next(iter(history.values()))["t"]) - clock.start
     ends = np.append(t, t[-1] + (t[-1] - t[-2] if len(t) > 1 else 1.0))
@@ -183,8 +188,8 @@ def _draw_cases(axes: Axes, history: dict[str, dict[str, np.ndarray]], clock: Cl
     axes.set(xlabel=_time(clock), ylabel="robot")
     axes.set_title("Active rows (cases)", pad=16)
     handles = [
-        Patch(facecolor=grey, edgecolor="0.5", label=f"{case}: {words}")
-        for case, grey, words in zip(CASES, CASE_GREYS, CASE_WORDS, strict=True)
+        Patch(facecolor=grey, edgecolor="0.5", label=f"{case}: {told}")
+        for case, grey, told in zip(CASES, CASE_GREYS, words, strict=True)
     ]
     style = {"fontsize": 7.5, "handlelength": 1, "columnspacing": 0.9, "handletextpad": 0.4, "borderaxespad": 0.2}
     axes.legend(handles=handles, ncols=5, loc="lower left", bbox_to_anchor=(0.0, 1.0), **style)

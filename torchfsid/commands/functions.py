@@ -44,7 +44,12 @@ LogLike = Log | Trajectory | str | Path
 
 
 def read_log(
-    path: str | Path, *, bag: Section | None = None, heading: str | None = None, form: Section | None = None
+    path: str | Path,
+    *,
+    bag: Section | None = None,
+    heading: str | None = None,
+    form: Section | None = None,
+    in_space: bool = False,
 ) -> Log:
     """Read a log: CSV, Parquet, a ROS 2 bag, or a log of motion capture.
 
@@ -53,13 +58,15 @@ def read_log(
         bag: where the bodies are in a ROS bag, the section `bag` of the configuration.
         heading: the column of headings [rad], for unicycles.
         form: the form of a log of motion capture, the section `log` of the configuration.
+        in_space: robots of bags and of motion capture are in space. Tables are if they have a column z.
 
     Raises:
         LogError: it cannot be read, or is not what its suffix says. The message names the line.
         ConfigError: a section is wrong, or a ROS bag comes without `bag`.
     """
     topics = None if bag is None else validate(bag, BagConfig, "bag")
-    return read.read_log(path, topics, heading, None if form is None else validate(form, LogConfig, "form"))
+    exported = None if form is None else validate(form, LogConfig, "form")
+    return read.read_log(path, topics, heading, exported, in_space)
 
 
 def observe(
@@ -145,5 +152,6 @@ def _read(log: LogLike, config: ObserveConfig) -> Log:
     if isinstance(log, Trajectory):
         return log_of(log, names_of(log))
     if isinstance(log, str | Path):
-        return read.read_log(log, config.bag, None if config.body is None else config.body.heading, config.log)
+        heading = None if config.body is None else config.body.heading
+        return read.read_log(log, config.bag, heading, config.log, config.dimension == 3)
     raise InputError("log", "a Log, a Trajectory or the path of a log", type(log).__name__)

@@ -19,10 +19,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchfsid.commands.figures import draw_observation
 from torchfsid.commands.map_panel import Marks
 from torchfsid.commands.observe import Observation, Verdict
 from torchfsid.commands.results_folder import OBSERVE, ResultsFolder, write_json, write_whole
+from torchfsid.commands.space_figure import draw_regions
 from torchfsid.config.documents import dump
 from torchfsid.errors import InputError
 from torchfsid.logs.log import Log
@@ -140,9 +140,7 @@ class Observed:
             FigureError: it cannot be drawn.
             OSError: the file cannot be written.
         """
-        drawn = draw_observation(
-            self._out, self.log.x, self.log.seen, self.log.bodies, Marks.of(self.observation.config)
-        )
+        drawn = draw_regions(self._out, self.log.x, self.log.seen, self.log.bodies, Marks.of(self.observation.config))
         of_suffix = {figure.suffix: figure for figure in drawn}
         if path is None:
             return of_suffix[".png"]

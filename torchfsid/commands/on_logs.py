@@ -12,7 +12,6 @@ from rich.markup import escape
 from torchfsid.commands.check import check
 from torchfsid.commands.command_line import use_one_thread
 from torchfsid.commands.declared_log import AUTO_FACTOR, DeclaredLog
-from torchfsid.commands.figures import draw_observation
 from torchfsid.commands.hypotheses import Hypotheses
 from torchfsid.commands.map_panel import Marks
 from torchfsid.commands.observe import Observation, times_in
@@ -26,6 +25,7 @@ from torchfsid.commands.results_folder import ResultsFolder, write_json, write_w
 from torchfsid.commands.safety_figure import draw_safety
 from torchfsid.commands.scan import Range, scan
 from torchfsid.commands.scan_figure import draw_scan
+from torchfsid.commands.space_figure import draw_regions
 from torchfsid.commands.terminal import console, status, track
 from torchfsid.config.documents import dump
 from torchfsid.config.models import dump_models
@@ -101,7 +101,7 @@ def observe_log(
             observation.run(out, shown, source, mcap, path if merge else None)
             with status("Drawing"):
                 seen = observation.log
-                draw_observation(out, seen.x, seen.seen, seen.bodies, Marks.of(observation.config))
+                draw_regions(out, seen.x, seen.seen, seen.bodies, Marks.of(observation.config))
                 if observation.config.is_unknown:
                     draw_safety(out)
         except (OSError, FigureError) as problem:
@@ -178,7 +178,7 @@ def _require_viewable(mcap: Path, models: Mapping[str, ObserveConfig], merge: bo
 def _read(path: Path, models: Mapping[str, ObserveConfig]) -> Log:
     first = next(iter(models.values()))
     heading = None if first.body is None else first.body.heading
-    return read_log(path, first.bag, heading, first.log)
+    return read_log(path, first.bag, heading, first.log, in_space=first.dimension == 3)
 
 
 def _ready(models: Mapping[str, DeclaredLog]) -> Observation | Hypotheses:

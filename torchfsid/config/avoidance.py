@@ -13,6 +13,7 @@ from torchfsid.config.documents import Strict, wrong
 from torchfsid.config.quantities import (
     BodyName,
     Flag,
+    Lengths,
     NonNegativeOrInterval,
     Positive,
     PositiveOrInterval,
@@ -69,22 +70,29 @@ class ClassKConfig(Strict):
 
 
 class _KeepsDistance(Strict):
-    """A barrier between bodies, with a safety distance or a margin. Exactly one of the two is given.
+    """A barrier between bodies, with a safety distance, a margin or an ellipsoid. Exactly one of them is given.
 
     Attributes:
         safety_distance: distance between centres [m].
         safety_distances: distances to single bodies that replace `safety_distance` [m].
         margin: distance between the discs of two bodies [m], if the log has radii.
+        ellipsoid: semi-axes of the ellipsoid around a body that the centres of others keep out of [m]. h is then that
+            of the coordinates divided by them, with the safety distance 1.
         soft: the controller may violate the rows.
     """
 
     safety_distance: PositiveOrInterval | None = None
     safety_distances: dict[BodyName, Positive] = Field(default_factory=dict)
     margin: NonNegativeOrInterval | None = None
+    ellipsoid: Lengths | None = None
     soft: Flag = False
 
     @model_validator(mode="after")
     def _one_distance(self) -> _KeepsDistance:
+        if self.ellipsoid is not None:
+            if self.safety_distance is not None or self.margin is not None or self.safety_distances:
+                raise wrong("expected no other distance beside it", "ellipsoid")
+            return self
         if (self.safety_distance is None) == (self.margin is None):
             raise wrong(f"expected safety_distance or margin, got {'neither' if self.margin is None else 'both'}")
         if self.safety_distances and self.margin is not None:
@@ -94,6 +102,11 @@ class _KeepsDistance(Strict):
         require_interval("safety_distance", self.safety_distance)
         require_interval("margin", self.margin)
         return self
+
+    @property
+    def dimension(self) -> int | None:
+        """The dimension in which the rows are, 2 or 3. None: in both."""
+        return None if self.ellipsoid is None else len(self.ellipsoid)
 
     @property
     def uses_radius(self) -> bool:
@@ -162,6 +175,8 @@ class AvoidanceConfig(_KeepsDistance):
     def _is_known_or_shared(self) -> AvoidanceConfig:
         if self.safety_distances and self.is_unknown:
             raise wrong("bodies have no distances of their own where safety parameters are unknown", "safety_distances")
+        if self.ellipsoid is not None and self.is_unknown:
+            raise wrong("expected a known gain with an ellipsoid", "class_k.gain")
         if self.shared is not None and not self.is_unknown:
             raise wrong("expected an unknown gain or distance [low, high] to be shared", "shared")
         return self
@@ -183,10 +198,14 @@ class AvoidanceConfig(_KeepsDistance):
             ConfigError: `safety_distances` names a body that is not there.
         """
         from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
+        from torchfsid.robots.ellipsoid import Ellipsoid
 
         Ds, gain, margin = self._distances(bodies), known(self.class_k.gain), known(self.margin)
         assert gain is not None
         class_k = ClassK(gain, self.class_k.power)
+        if self.ellipsoid is not None:
+            ball = CollisionAvoidance(class_k, 1.0, None, self.distance, self.neighbour_velocity, self.soft)
+            return Ellipsoid(ball, self.ellipsoid)
         return CollisionAvoidance(class_k, Ds, margin, self.distance, self.neighbour_velocity, self.soft)
 
     def build_unknown(self, radius: Sequence[float] | None) -> UnknownAvoidance:
@@ -266,6 +285,7 @@ class SecondOrderAvoidanceConfig(_KeepsDistance):
         Raises:
             ConfigError: `safety_distances` names a body that is not there.
         """
+        from torchfsid.robots.ellipsoid import Ellipsoid
         from torchfsid.robots.second_order import SecondOrderAvoidance
 
         (k1, of_1), (k2, of_2) = (as_middle(class_k.gain) for class_k in self.class_k)
@@ -275,10 +295,11 @@ class SecondOrderAvoidanceConfig(_KeepsDistance):
         elif isinstance(self.safety_distance, tuple):
             Ds, error = as_middle(self.safety_distance)
         else:
-            Ds = self._distances(bodies)
-        return SecondOrderAvoidance(
+            Ds = 1.0 if self.ellipsoid is not None else self._distances(bodies)
+        barrier = SecondOrderAvoidance(
             (k1, k2), Ds, margin, self.neighbour_acceleration, self.soft, (of_1, of_2), distance_error=error
         )
+        return barrier if self.ellipsoid is None else Ellipsoid(barrier, self.ellipsoid)
 
 
 def _commonest_sum(radius: Sequence[float]) -> float:

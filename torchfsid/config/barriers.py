@@ -15,9 +15,10 @@ from torchfsid.config.avoidance import AvoidanceConfig, ClassKConfig, SecondOrde
 from torchfsid.config.documents import Strict, wrong
 from torchfsid.config.quantities import (
     Flag,
+    Lengths,
     NonNegative,
     NonNegativeOrInterval,
-    PlanarVector,
+    Place,
     Positive,
     PositiveOrInterval,
     Units,
@@ -46,6 +47,11 @@ class _RobotsOwn(Strict):
     narrowed: ClassVar[Units] = {}
 
     @property
+    def dimension(self) -> int | None:
+        """The dimension in which the rows are, 2 or 3. None: in both."""
+        return None
+
+    @property
     def uses_radius(self) -> bool:
         return False
 
@@ -66,8 +72,12 @@ class SpeedBoxConfig(_RobotsOwn):
     """
 
     kind: Literal["speed_box"] = "speed_box"
-    limit: Annotated[tuple[Positive, ...], Field(min_length=2, max_length=2)]
+    limit: Lengths
     soft: Flag = False
+
+    @property
+    def dimension(self) -> int:
+        return len(self.limit)
 
     def build(self, bodies: Sequence[str]) -> Barrier:
         """The barrier. It does not depend on the bodies."""
@@ -85,9 +95,13 @@ class AccelerationBoxConfig(_RobotsOwn):
     """
 
     kind: Literal["acceleration_box"] = "acceleration_box"
-    limit: Annotated[tuple[Positive, ...], Field(min_length=2, max_length=2)]
+    limit: Lengths
     soft: Flag = False
     is_second_order: ClassVar[bool] = True
+
+    @property
+    def dimension(self) -> int:
+        return len(self.limit)
 
     def build(self, bodies: Sequence[str]) -> Barrier:
         """The barrier. It does not depend on the bodies."""
@@ -110,6 +124,10 @@ class SpeedPolygonConfig(_RobotsOwn):
     limit: Positive
     soft: Flag = False
 
+    @property
+    def dimension(self) -> int:
+        return 2
+
     def build(self, bodies: Sequence[str]) -> Barrier:
         """The barrier. It does not depend on the bodies."""
         from torchfsid.robots.barriers import SpeedPolygon
@@ -129,12 +147,16 @@ class ArenaConfig(_RobotsOwn):
     """
 
     kind: Literal["arena"] = "arena"
-    lower: PlanarVector
-    upper: PlanarVector
+    lower: Place
+    upper: Place
     margin: NonNegative = 0.0
     class_k: ClassKConfig
     soft: Flag = False
     suspects: ClassVar[tuple[str, ...]] = ("class_k.gain", "margin", "lower", "upper")
+
+    @property
+    def dimension(self) -> int:
+        return len(self.lower)
 
     @model_validator(mode="after")
     def _is_a_box(self) -> ArenaConfig:
@@ -216,6 +238,10 @@ class OrcaConfig(Strict):
         return self
 
     @property
+    def dimension(self) -> int:
+        return 2
+
+    @property
     def uses_radius(self) -> bool:
         return True
 
@@ -254,6 +280,43 @@ class OrcaConfig(Strict):
         )
 
 
+class BufferedVoronoiConfig(_RobotsOwn):
+    """`BufferedVoronoi`: the cells of the Crazyflie's firmware.
+
+    Attributes:
+        ellipsoid: radii of one robot's ellipsoid [m].
+        horizon: the time for which a velocity is kept [s].
+        max_speed: the largest speed on every axis [m/s].
+        sidestep: distance of a wall below which the firmware may turn the command [m]; 0 if it was switched off.
+        soft: the controller may violate the rows.
+    """
+
+    kind: Literal["buffered_voronoi"] = "buffered_voronoi"
+    ellipsoid: Lengths
+    horizon: Positive
+    max_speed: Positive
+    sidestep: NonNegative = 0.25
+    soft: Flag = False
+    uncertain: ClassVar[bool] = True
+
+    @model_validator(mode="after")
+    def _can_move(self) -> BufferedVoronoiConfig:
+        if self.horizon * self.max_speed <= self.sidestep:
+            reach = f"horizon * max_speed = {self.horizon * self.max_speed:g} m"
+            raise wrong(f"expected less than {reach}: every command could be turned", "sidestep")
+        return self
+
+    @property
+    def dimension(self) -> int:
+        return len(self.ellipsoid)
+
+    def build(self, bodies: Sequence[str]) -> Barrier:
+        """The barrier. It does not depend on the bodies' names."""
+        from torchfsid.robots.buffered_voronoi import BufferedVoronoi
+
+        return BufferedVoronoi(self.ellipsoid, self.horizon, self.max_speed, self.sidestep, self.soft)
+
+
 SECOND_ORDER = "avoidance, order: 2"
 
 
@@ -274,6 +337,7 @@ BarrierConfig = Annotated[
     | Annotated[SpeedBoxConfig, Tag("speed_box")]
     | Annotated[AccelerationBoxConfig, Tag("acceleration_box")]
     | Annotated[SpeedPolygonConfig, Tag("speed_polygon")]
-    | Annotated[ArenaConfig, Tag("arena")],
+    | Annotated[ArenaConfig, Tag("arena")]
+    | Annotated[BufferedVoronoiConfig, Tag("buffered_voronoi")],
     Discriminator(_kind),
 ]

@@ -63,9 +63,14 @@ class GivenTask(_Given, _Task):
 
     kind: Literal["python"] = GIVEN
 
-    @property
-    def parameters(self) -> int:
+    def parameters(self, dimension: int) -> int:
         return len(self.object.parameter_names)
+
+    @property
+    def dimensions(self) -> tuple[int, ...]:
+        """What the task says. An own task that says nothing may be of either."""
+        said = getattr(self.object, "dimension", None)
+        return (2, 3) if said is None else (said,)
 
     @property
     def unit(self) -> str:
@@ -84,7 +89,7 @@ class GivenTask(_Given, _Task):
     def is_clipped(self) -> bool:
         return getattr(self.object, "saturation", None) is not None
 
-    def build(self, bodies: Sequence[str]) -> Any:
+    def build(self, bodies: Sequence[str], dimension: int = 2) -> Any:
         """The task itself."""
         return self.object
 
@@ -107,6 +112,11 @@ class GivenBarrier(_Given):
     @property
     def uncertain(self) -> bool:
         return bool(getattr(self.object, "uncertain", False))
+
+    @property
+    def dimension(self) -> None:
+        """What is in the object is not known here."""
+        return None
 
     @property
     def uses_radius(self) -> bool:

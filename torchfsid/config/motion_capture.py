@@ -33,7 +33,7 @@ TIME_UNITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}
 
 
 class BodyColumns(Strict):
-    """The columns of one body, with axes as in the export. Velocities and the column along the vertical are optional.
+    """The columns of one body, with axes as in the export. Velocities, and in the plane the vertical, are optional.
 
     Attributes:
         file: file in the folder LOG, if the body has one of its own.

@@ -15,6 +15,7 @@ from torchfsid.config.avoidance import AvoidanceConfig
 from torchfsid.config.bags import BagConfig
 from torchfsid.config.barriers import BarrierConfig
 from torchfsid.config.bodies import UnicycleConfig
+from torchfsid.config.dimensions import dimensions_of, require_one_dimension
 from torchfsid.config.documents import Strict, wrong
 from torchfsid.config.given import GIVEN, GivenBarrier, GivenTask, a_barrier, a_prior, a_task, bounds, is_object
 from torchfsid.config.motion_capture import LogConfig
@@ -66,7 +67,7 @@ class ObserveConfig(Strict):
     Attributes:
         task: the task, whose parameter theta is inferred.
         barriers: the barriers, in the order of their rows.
-        prior: the prior set of theta.
+        prior: the prior set of theta. The number of its entries says whether robots are in the plane or in space.
         noise: bounds on the errors of the log.
         set: which set is intersected over time.
         active_tolerance: distance of the control from a row's boundary below which the row counts as active [m/s] (G.,
@@ -118,11 +119,9 @@ class ObserveConfig(Strict):
 
     @model_validator(mode="after")
     def _fits_together(self) -> ObserveConfig:
-        expected, got = self.task.parameters, len(self.prior.lower)
-        if got != expected:
-            raise wrong(f"task '{self.task.kind}' has {expected} parameters, lower and upper have {got}", "prior")
+        require_one_dimension(self.dimensions, self.barriers)
         for robot, theta in (self.truth or {}).items():
-            if len(theta) != expected:
+            if len(theta) != (expected := len(self.prior.lower)):
                 raise wrong(f"task '{self.task.kind}' has {expected} parameters, got {len(theta)}", f"truth.{robot}")
         require_one_order(self.dynamics, self.task, self.barriers, self.noise)
         self._require_poses()
@@ -153,6 +152,8 @@ class ObserveConfig(Strict):
             if self.windows is not None:
                 raise wrong("expected velocity: windows beside it", "windows")
             return
+        if self.dimension == 3:
+            raise wrong("windows are for robots in the plane, take differentiated in space", "velocity")
         if self.is_second_order:
             raise wrong("windows are means of velocities, take differentiated with a double_integrator", "velocity")
         if self.set == "critical_region":
@@ -187,6 +188,8 @@ class ObserveConfig(Strict):
             return
         if self.is_second_order:
             raise wrong("unicycles are driven by velocities, expected dynamics: single_integrator", "body")
+        if self.dimension == 3:
+            raise wrong("unicycles are in the plane, and the prior says that robots are in space", "body")
         if self.velocity != "differentiated":
             raise wrong(
                 f"commands of unicycles come from poses: expected 'differentiated', got {self.velocity!r}", "velocity"
@@ -196,6 +199,16 @@ class ObserveConfig(Strict):
     def is_second_order(self) -> bool:
         """Are the robots driven by accelerations?"""
         return self.dynamics == "double_integrator"
+
+    @property
+    def dimensions(self) -> tuple[int, ...]:
+        """Where the robots may be: in the plane (2), in space (3), or either, if an own task does not say it."""
+        return dimensions_of(self.task, self.prior)
+
+    @property
+    def dimension(self) -> int:
+        """Are the robots in the plane (2) or in space (3)? The plane, if neither is said."""
+        return self.dimensions[0]
 
     def with_bound(self, bound: float) -> ObserveConfig:
         """The same configuration with another bound on the error of controls [`noise.unit`]."""

@@ -42,6 +42,11 @@ Flag = Annotated[bool, Field(strict=True)]
 BodyName = Annotated[str, BeforeValidator(_name)]
 Vector = Annotated[tuple[Number, ...], Field(min_length=1)]
 PlanarVector = Annotated[tuple[Number, ...], Field(min_length=2, max_length=2)]
+Place = Annotated[tuple[Number, ...], Field(min_length=2, max_length=3)]
+"""A vector in the plane or in space."""
+
+Lengths = Annotated[tuple[Positive, ...], Field(min_length=2, max_length=3)]
+"""One positive length for each axis."""
 
 
 def _one_or_two(value: object) -> str:

@@ -13,7 +13,7 @@ from torchfsid.config.quantities import (
     BodyName,
     NonNegative,
     Number,
-    PlanarVector,
+    Place,
     Positive,
     PositiveOrInterval,
     Units,
@@ -46,7 +46,7 @@ class BoxSaturationConfig(Strict):
     """
 
     kind: Literal["box"] = "box"
-    limit: PlanarVector
+    limit: Place
 
     @model_validator(mode="after")
     def _is_positive(self) -> BoxSaturationConfig:
@@ -71,10 +71,14 @@ class _Task(Strict):
     is_place: ClassVar[bool] = True
     suspects: ClassVar[tuple[str, ...]] = ("kind",)
 
+    def parameters(self, dimension: int) -> int:
+        """p, the number of entries of theta of robots in the plane (2) or in space (3)."""
+        return dimension
+
     @property
-    def parameters(self) -> int:
-        """p, the number of entries of theta."""
-        return 2
+    def dimensions(self) -> tuple[int, ...]:
+        """Whether the robots may be in the plane (2), in space (3), or both."""
+        return 2, 3
 
     @property
     def is_clipped(self) -> bool:
@@ -176,28 +180,33 @@ class GoalConfig(_Task):
         return self.saturation is not None or self.dead_zone > 0 or self.law == "constant_speed"
 
     @property
-    def _limits(self) -> tuple[float, float]:
-        if self.saturation is None:
-            return math.inf, math.inf
-        limit = self.saturation.limit
-        return (limit[0], limit[1]) if isinstance(limit, tuple) else (limit, limit)
+    def dimensions(self) -> tuple[int, ...]:
+        limit = None if self.saturation is None else self.saturation.limit
+        return (len(limit),) if isinstance(limit, tuple) else (2, 3)
 
-    def build(self, bodies: Sequence[str]) -> Task:
+    @property
+    def _limits(self) -> tuple[float, ...]:
+        """One limit per axis. A single one is for all."""
+        limit = math.inf if self.saturation is None else self.saturation.limit
+        return limit if isinstance(limit, tuple) else (limit,)
+
+    def build(self, bodies: Sequence[str], dimension: int = 2) -> Task:
         """The `GoalTask` with these values."""
         from torchfsid.robots.tasks import GoalTask, Saturation
 
         if self.speed is not None and self.tolerance is not None:
-            saturation = Saturation("norm", (self.speed, self.speed), dead_speed=self.speed)
-            return GoalTask(self.speed / self.tolerance, saturation=saturation)
+            saturation = Saturation("norm", (self.speed,) * dimension, dead_speed=self.speed)
+            return GoalTask(self.speed / self.tolerance, dimension, saturation)
         assert self.gain is not None
         gain, error = as_middle(self.gain)
         saturation = None
         if self.is_clipped:
             shape = "norm" if self.saturation is None else self.saturation.kind
-            saturation = Saturation(shape, self._limits, gain * self.dead_zone)
+            limits = self._limits if len(self._limits) > 1 else self._limits * dimension
+            saturation = Saturation(shape, limits, gain * self.dead_zone)
         if self.velocity_loop is not None:
-            return GoalTask.in_velocity_loop(gain, self.velocity_loop, saturation, error)
-        return GoalTask(gain, saturation=saturation, gain_error=error, damping=self.damping or 0.0)
+            return GoalTask.in_velocity_loop(gain, self.velocity_loop, saturation, error, dimension)
+        return GoalTask(gain, dimension, saturation, error, self.damping or 0.0)
 
 
 class UnknownGainGoalConfig(_Task):
@@ -206,15 +215,14 @@ class UnknownGainGoalConfig(_Task):
     kind: Literal["goal_unknown_gain"] = "goal_unknown_gain"
     unit: ClassVar[str] = ""
 
-    @property
-    def parameters(self) -> int:
-        return 3
+    def parameters(self, dimension: int) -> int:
+        return 1 + dimension
 
-    def build(self, bodies: Sequence[str]) -> Task:
+    def build(self, bodies: Sequence[str], dimension: int = 2) -> Task:
         """The `UnknownGainGoalTask`."""
         from torchfsid.robots.tasks import UnknownGainGoalTask
 
-        return UnknownGainGoalTask()
+        return UnknownGainGoalTask(dimension)
 
 
 class VelocityConfig(_Task):
@@ -224,11 +232,11 @@ class VelocityConfig(_Task):
     unit: ClassVar[str] = "m/s"
     is_place: ClassVar[bool] = False
 
-    def build(self, bodies: Sequence[str]) -> Task:
+    def build(self, bodies: Sequence[str], dimension: int = 2) -> Task:
         """The `VelocityTask`."""
         from torchfsid.robots.tasks import VelocityTask
 
-        return VelocityTask()
+        return VelocityTask(dimension)
 
 
 class FormationConfig(_Task):
@@ -249,7 +257,7 @@ class FormationConfig(_Task):
     def required(self) -> tuple[str, ...]:
         return (self.leader,)
 
-    def build(self, bodies: Sequence[str]) -> Task:
+    def build(self, bodies: Sequence[str], dimension: int = 2) -> Task:
         """The `FormationTask` among these bodies.
 
         Raises:
@@ -258,7 +266,7 @@ class FormationConfig(_Task):
         from torchfsid.robots.tasks import FormationTask
 
         require_body("task.leader", self.leader, bodies)
-        return FormationTask(self.gain, leader=list(bodies).index(self.leader))
+        return FormationTask(self.gain, list(bodies).index(self.leader), dimension)
 
 
 class OrbitConfig(_Task):
@@ -272,7 +280,11 @@ class OrbitConfig(_Task):
     rate: Number
     suspects: ClassVar[tuple[str, ...]] = ("rate",)
 
-    def build(self, bodies: Sequence[str]) -> Task:
+    @property
+    def dimensions(self) -> tuple[int, ...]:
+        return (2,)
+
+    def build(self, bodies: Sequence[str], dimension: int = 2) -> Task:
         """The `OrbitTask` with these values."""
         from torchfsid.robots.tasks import OrbitTask
 
@@ -294,15 +306,14 @@ class PatrolConfig(_Task):
     harmonics: Annotated[int, Field(strict=True, ge=1)] = 1
     suspects: ClassVar[tuple[str, ...]] = ("gain", "rate", "harmonics")
 
-    @property
-    def parameters(self) -> int:
-        return 2 + 4 * self.harmonics
+    def parameters(self, dimension: int) -> int:
+        return dimension * (1 + 2 * self.harmonics)
 
-    def build(self, bodies: Sequence[str]) -> Task:
+    def build(self, bodies: Sequence[str], dimension: int = 2) -> Task:
         """The `PatrolTask` with these values."""
         from torchfsid.robots.tasks import PatrolTask
 
-        return PatrolTask(self.gain, self.rate, self.harmonics)
+        return PatrolTask(self.gain, self.rate, self.harmonics, dimension)
 
 
 TaskConfig = Annotated[

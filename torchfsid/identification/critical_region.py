@@ -15,7 +15,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchfsid.halfspaces import Halfspaces, dot
-from torchfsid.identification.kkt import KktSolution, outward_normals, solve_kkt
+from torchfsid.identification.kkt import KktSolution, solve_kkt
+from torchfsid.identification.normals import outward_normals
 from torchfsid.tolerances import CRITICAL_NORMALS, RANK_TOLERANCE
 
 
@@ -25,13 +26,13 @@ def critical_region(
     C: Float[Tensor, "*batch n p"],
     d: Float[Tensor, "*batch n"],
 ) -> Halfspaces:
-    """Omega as half-spaces of theta: rows 0..m-1 keep row j inactive, the last 4 keep the multipliers non-negative.
+    """Omega as half-spaces of theta: rows 0..m-1 keep row j inactive, the others keep the multipliers non-negative.
 
     Rows that do not restrict theta are padding. `source` is j where row j must stay inactive, and m + j where its
-    multiplier must not be negative. Controls are planar (n = 2), p is any.
+    multiplier must not be negative. Controls are in the plane or in space, p is any.
 
     Raises:
-        InputError: shapes do not fit, or controls are not planar.
+        InputError: shapes do not fit, or controls are neither in the plane nor in space.
     """
     C, d = C.to(torch.float64), d.to(torch.float64)
     return region_of(safe_controls.normalised(), solve_kkt(safe_controls, active, C, d), C, d)

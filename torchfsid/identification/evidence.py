@@ -16,8 +16,8 @@ among them, hold each other: some positive combination of them is zero. So the s
 of the rows that may be active contains a line. If it contains none, no row of such a barrier may be violated. Since
 controllers are not exact where it nearly contains one, a violation is then no alarm, either (`RELAXED_OPENING`).
 
-The measurements of a whole log can be concatenated into one batch. In the plane, where no gradient is needed, compiled
-code computes the same from the slacks on (`kernels.evidence`).
+The measurements of a whole log can be concatenated into one batch. In the plane and in space, where no gradient is
+needed, compiled code computes the same from the slacks on (`kernels.evidence`, `kernels.evidence_in_space`).
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ from torchfsid.identification.critical_region import region_of
 from torchfsid.identification.inverse_optimal import normals_of, per_row, set_around, without_direction
 from torchfsid.identification.kkt import KktSolution, solve_unit
 from torchfsid.kernels import evidence as kernel
+from torchfsid.kernels.evidence_in_space import evidence_in_space
 from torchfsid.robots.arguments import require_barriers, require_choice, require_task
 from torchfsid.robots.barriers import Barrier, controller_failed, possible_rows, row_errors
 from torchfsid.robots.bounds import ErrorBounds, NoiseBound, RowErrors
@@ -199,7 +200,8 @@ def evidence(
             not known exactly, and for position errors of tasks with an unknown gain.
         measurement: a measurement of these robots, or several concatenated.
         compiled: whether to run compiled code instead of torch. None chooses compiled code wherever it is possible:
-            controls and theta are planar, no gradient is needed, and tensors are on the CPU.
+            controls are in the plane or in space, no gradient is needed, and tensors are on the CPU. A nominal control
+            is clipped only if theta is planar, and rows are relaxed only in the plane.
 
     Raises:
         InputError: the measurement has no velocities, they are not finite for an observed robot, the measurement does
@@ -307,9 +309,13 @@ def _can_be_compiled(model: ObservationModel, sample: Sample, wanted: bool | Non
     tensors = [sample.rows.A, sample.rows.b, sample.C, sample.d, sample.u, sample.bound, sample.ball, sample.drift]
     if model.task.saturation is not None and sample.corners is not None:
         tensors.append(sample.corners)
-    obstacle = None
-    if not sample.rows.dim == sample.C.shape[-1] == 2:
-        obstacle = "theta is not planar"
+    obstacle, in_space, clipped = None, sample.rows.dim == 3, model.task.saturation is not None
+    if sample.rows.dim not in (2, 3):
+        obstacle = "controls are neither in the plane nor in space"
+    elif clipped and not sample.rows.dim == sample.C.shape[-1] == 2:
+        obstacle = "the nominal control is clipped, and theta is not planar"
+    elif in_space and bool(sample.relaxed.any()):
+        obstacle = "rows are relaxed, in space"
     elif torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
         obstacle = "gradients are required"
     elif not all(tensor.is_cpu for tensor in tensors):
@@ -321,19 +327,24 @@ def _can_be_compiled(model: ObservationModel, sample: Sample, wanted: bool | Non
 
 def _compiled(model: ObservationModel, sample: Sample) -> Evidence:
     angles = sample.u[:, :0] if sample.row_errors is None else sample.row_errors.angle
-    tensors = (
-        sample.rows.A, sample.rows.b, sample.hard, sample.relaxed, sample.C, sample.d, sample.u, sample.usable,
+    rows, relaxed = (sample.rows.A, sample.rows.b, sample.hard), (sample.relaxed,)
+    others = (
+        sample.C, sample.d, sample.u, sample.usable,
         torch.atleast_2d(sample.bound), angles, torch.atleast_1d(sample.ball), torch.atleast_1d(sample.drift),
     )  # fmt: skip
     saturation, paper, clip = model.task.saturation, model.kind == "critical_region", NO_CLIP
-    if saturation is not None:
-        assert sample.corners is not None
-        limits = np.array(saturation.limits, dtype=np.float64)
-        clip = limits, saturation.shape == "norm", float(saturation.dead_speed), array(sample.corners)
-    rows, judged, kkt = kernel.evidence(*map(array, tensors), clip, paper, model.active_tolerance)
+    if sample.rows.dim == 3:
+        found = evidence_in_space(*map(array, rows + others), paper, model.active_tolerance)
+    else:
+        if saturation is not None:
+            assert sample.corners is not None
+            limits = np.array(saturation.limits, dtype=np.float64)
+            clip = limits, saturation.shape == "norm", float(saturation.dead_speed), array(sample.corners)
+        found = kernel.evidence(*map(array, rows + relaxed + others), clip, paper, model.active_tolerance)
+    half_spaces, judged, kkt = found
     informative, alarmed, infeasible, slack, excess = map(torch.from_numpy, judged)
     solved = KktSolution(*map(torch.from_numpy, kkt))
-    omega = Halfspaces(*map(torch.from_numpy, rows))
+    omega = Halfspaces(*map(torch.from_numpy, half_spaces))
     return Evidence(
         omega, informative, alarmed, infeasible, slack, excess, sample.hard, lambda: solved, sample.omega_without(model)
     )

@@ -9,10 +9,11 @@ n of the cone gives one half-space n.(C theta + d - u) <= velocity. A fan of nor
 by an outer polygon. An intersection over time never recovers from one wrong set. Unlike the critical region, this set
 stays right if a solver is inexact or a row is nearly active.
 
-Errors of positions turn the rows, move their boundaries and shift C theta + d. So generators become fans, the slack
-test widens (`RowErrors`), and the ball grows by the drift of C theta + d. A row of unknown direction that may be active
-is a generator in all directions, and the set is the whole space. Only a zero row without such an error is padding. A
-clipped nominal control opens the set in the directions of saturation (`saturation`). Each widening gives an outer set.
+Errors of positions turn the rows, move their boundaries and shift C theta + d. So generators become fans (in space: the
+edges of pyramids around circular cones), the slack test widens (`RowErrors`), and the ball grows by the drift of
+C theta + d. A row of unknown direction that may be active is a generator in all directions, and the set is the whole
+space. Only a zero row without such an error is padding. A clipped nominal control opens the set in the directions of
+saturation (`saturation`). Each widening gives an outer set.
 This set is not in the paper; docs/theory.md has the proofs.
 """
 
@@ -26,8 +27,9 @@ from torch import Tensor
 
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, dot
-from torchfsid.identification.kkt import OutwardNormals, outward_normals
+from torchfsid.identification.normals import OutwardNormals, outward_normals
 from torchfsid.identification.saturation import unclipped
+from torchfsid.kernels.cones import RING
 from torchfsid.robots.bounds import NoiseBound, RowErrors
 from torchfsid.robots.tasks import Saturation
 from torchfsid.tolerances import NORMALS, SPREAD
@@ -45,7 +47,7 @@ def inverse_optimal_set(
     saturation: Saturation | None = None,
     possible: Float[Tensor, "*batch v n"] | None = None,
 ) -> Halfspaces:
-    """The set as half-spaces of theta, with unneeded rows as padding. Controls are planar (n = 2), p is any.
+    """The set as half-spaces of theta, with unneeded rows as padding. Controls are in the plane or in space, p is any.
 
     `source` is m + j where a half-space comes from the multiplier of row j, and 2 m where it comes from no single row.
 
@@ -62,7 +64,7 @@ def inverse_optimal_set(
             saturation.
 
     Raises:
-        InputError: a saturation without `possible`, or controls that are not planar.
+        InputError: a saturation without `possible`, or controls of another dimension.
     """
     u, C, d = u.to(torch.float64), C.to(torch.float64), d.to(torch.float64)
     unit = safe_controls.normalised()
@@ -84,11 +86,10 @@ def normals_of(unit: Halfspaces, near: Bool[Tensor, "*batch m"], row_errors: Row
     else:
         unknown = without_direction(unit, row_errors)
         may_be_active = near & ((generators != 0).any(-1) | unknown)
-        east = generators.new_tensor([1.0, 0.0])
+        east = torch.eye(unit.dim, dtype=generators.dtype, device=generators.device)[0]
         generators = torch.where(unknown.unsqueeze(-1), east, generators)
         angle = torch.where(unknown, math.pi, row_errors.angle)
-        generators = torch.cat([_turned(generators, fraction * angle) for fraction in SPREAD], dim=-2)
-        may_be_active = torch.cat([may_be_active] * len(SPREAD), dim=-1)
+        generators, may_be_active = (_pyramid if unit.dim == 3 else _fan)(generators, may_be_active, angle)
     outward = outward_normals(generators, may_be_active, NORMALS)
     none = outward.generator == generators.shape[-2]
     return outward._replace(generator=torch.where(none, unit.rows, outward.generator % max(unit.rows, 1)))
@@ -129,7 +130,40 @@ def per_row(bound: float | Float[Tensor, "*batch"], like: Tensor) -> Float[Tenso
     return torch.as_tensor(bound, dtype=like.dtype, device=like.device).unsqueeze(-1)
 
 
+def _fan(
+    rows: Float[Tensor, "*batch m 2"], present: Bool[Tensor, "*batch m"], angle: Float[Tensor, "*batch m"]
+) -> tuple[Float[Tensor, "*batch g 2"], Bool[Tensor, "*batch g"]]:
+    """Rows turned by fractions of an angle, whose cone holds all of the rows turned by up to the angle."""
+    generators = torch.cat([_turned(rows, fraction * angle) for fraction in SPREAD], dim=-2)
+    return generators, torch.cat([present] * len(SPREAD), dim=-1)
+
+
 def _turned(rows: Float[Tensor, "*batch m 2"], angle: Float[Tensor, "*batch m"]) -> Float[Tensor, "*batch m 2"]:
     cos, sin = angle.cos(), angle.sin()
     x, y = rows.unbind(-1)
     return torch.stack([cos * x - sin * y, sin * x + cos * y], dim=-1)
+
+
+def _pyramid(
+    rows: Float[Tensor, "*batch m 3"], present: Bool[Tensor, "*batch m"], angle: Float[Tensor, "*batch m"]
+) -> tuple[Float[Tensor, "*batch g 3"], Bool[Tensor, "*batch g"]]:
+    """The edges of a pyramid around all of the unit rows turned by up to an angle. A row that is exact comes once.
+
+    The k = `RING` edges are at the angle atan(tan(angle)/cos(pi/k)), so that the faces touch the circular cone. From a
+    right angle on the cone is all of space, and so is that of edges that are in turn at 60 and at 120 degrees.
+    """
+    steep = angle >= math.pi / 2
+    slope = torch.where(steep, math.sqrt(3.0), torch.where(steep, 0.0, angle).tan() / math.cos(math.pi / RING))
+    cos = 1 / (1 + slope.square()).sqrt()
+    sin = cos * slope
+    least = rows.detach().abs().argmin(-1, keepdim=True)
+    across = torch.linalg.cross(rows, torch.zeros_like(rows).scatter(-1, least, 1.0), dim=-1)
+    across = across / torch.where((across == 0).all(-1, keepdim=True), 1.0, across).norm(dim=-1, keepdim=True)
+    upward = torch.linalg.cross(rows, across, dim=-1)
+    edges = []
+    for k in range(RING):
+        turn, along = 2 * math.pi * k / RING, torch.where(steep & (k % 2 == 1), -cos, cos)
+        aside = math.cos(turn) * across + math.sin(turn) * upward
+        edges.append(along.unsqueeze(-1) * rows + sin.unsqueeze(-1) * aside)
+    turned = present & (angle > 0)
+    return torch.cat(edges, dim=-2), torch.cat([present, *[turned] * (RING - 1)], dim=-1)

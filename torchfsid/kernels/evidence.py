@@ -39,8 +39,9 @@ DIRECTIONS, CRITICAL_DIRECTIONS = (
 def is_finite(k, C, d):
     """Is the nominal control of robot k finite?"""
     known = math.isfinite(d[k, 0]) and math.isfinite(d[k, 1])
-    known = known and math.isfinite(C[k, 0, 0]) and math.isfinite(C[k, 0, 1])
-    return known and math.isfinite(C[k, 1, 0]) and math.isfinite(C[k, 1, 1])
+    for e in range(C.shape[2]):
+        known = known and math.isfinite(C[k, 0, e]) and math.isfinite(C[k, 1, e])
+    return known
 
 
 @item
@@ -134,14 +135,14 @@ def solve_motion(k, C, d, wish_known, rank, offset, projector, free, G, f):
         f[k, i] = offset[k, i]
         if wish_known:
             f[k, i] += free[k, i, 0] * d[k, 0] + free[k, i, 1] * d[k, 1]
-            G[k, i, 0] = free[k, i, 0] * C[k, 0, 0] + free[k, i, 1] * C[k, 1, 0]
-            G[k, i, 1] = free[k, i, 0] * C[k, 0, 1] + free[k, i, 1] * C[k, 1, 1]
+            for e in range(C.shape[2]):
+                G[k, i, e] = free[k, i, 0] * C[k, 0, e] + free[k, i, 1] * C[k, 1, e]
 
 
 @item
 @no_type_check
 def outward_normals(angle, order, K, none, around, normals, generator):
-    """Fill the normals of `kkt.outward_normals` for K generators given by their angles.
+    """Fill the normals of `identification.normals` for K generators given by their angles.
 
     Args:
         angle: the generators' angles [rad], sorted here.
@@ -223,7 +224,7 @@ def critical_region(
         p, q = unit[j, 0], unit[j, 1]
         across = (p - p * P[k, 0, 0] - q * P[k, 1, 0]) ** 2 + (q - p * P[k, 0, 1] - q * P[k, 1, 1]) ** 2
         if not active[k, j] and across > least:
-            for i in range(2):
+            for i in range(C.shape[2]):
                 row_A[k, R, i] = p * G[k, 0, i] + q * G[k, 1, i]
             row_b[k, R], row_source[k, R] = unit_b[j] - p * f[k, 0] - q * f[k, 1], j
             R += 1
@@ -231,7 +232,7 @@ def critical_region(
         v, w = normals[n, 0], normals[n, 1]
         p, q = v * P[k, 0, 0] + w * P[k, 1, 0], v * P[k, 0, 1] + w * P[k, 1, 1]
         if p * p + q * q > least:
-            for i in range(2):
+            for i in range(C.shape[2]):
                 row_A[k, R, i] = p * C[k, 0, i] + q * C[k, 1, i]
             row_b[k, R] = v * offset[k, 0] + w * offset[k, 1] - p * d[k, 0] - q * d[k, 1]
             row_source[k, R] = m + generator[n]
@@ -245,7 +246,7 @@ def inverse_optimal(k, m, u, ball, C, d, normals, generator, count, none, row_A,
     x, y = u[k, 0] - d[k, 0], u[k, 1] - d[k, 1]
     for n in range(count):
         p, q = normals[n, 0], normals[n, 1]
-        for i in range(2):
+        for i in range(C.shape[2]):
             row_A[k, n, i] = p * C[k, 0, i] + q * C[k, 1, i]
         row_b[k, n] = p * x + q * y + ball
         row_source[k, n] = 2 * m if generator[n] == none else m + generator[n] % m
@@ -261,7 +262,7 @@ def evidence(A, b, hard, relaxed, C, d, u, usable, bound, angles, ball, drift, c
         b: (B, m), their bounds [m/s].
         hard: (m,), the rows that no controller may violate.
         relaxed: (m,), the rows of which the controller takes the least violation if they are infeasible.
-        C: (B, 2, 2), of the nominal control C theta + d.
+        C: (B, 2, p), of the nominal control C theta + d. Where it is clipped, p = 2.
         d: (B, 2), of the nominal control [m/s].
         u: (B, 2), the measured controls [m/s].
         usable: (B,), whether the sample may be used.
@@ -284,10 +285,10 @@ def evidence(A, b, hard, relaxed, C, d, u, usable, bound, angles, ball, drift, c
     around = CRITICAL_DIRECTIONS if paper else DIRECTIONS
     clips, work = len(clip[0]) > 0, workspace(clip[3].shape[1])
     R = ROWS if clips else (m if paper else 0) + len(around) + 1
-    row_A, row_b, row_source = np.zeros((B, R, 2)), np.ones((B, R)), np.full((B, R), -1)
+    row_A, row_b, row_source = np.zeros((B, R, C.shape[2])), np.ones((B, R)), np.full((B, R), -1)
     informative, alarmed, infeasible = np.empty(B, np.bool_), np.empty(B, np.bool_), np.zeros(B, np.bool_)
     slack, excess = np.empty((B, m)), np.empty((B, m))
-    G, f, projector, free = np.zeros((B, 2, 2)), np.zeros((B, 2)), np.zeros((B, 2, 2)), np.zeros((B, 2, 2))
+    G, f, projector, free = np.zeros((B, 2, C.shape[2])), np.zeros((B, 2)), np.zeros((B, 2, 2)), np.zeros((B, 2, 2))
     offset, active = np.zeros((B, 2)), np.empty((B, m), np.bool_)
     n_active, rank, case = np.empty(B, np.int64), np.empty(B, np.int64), np.empty(B, np.int64)
     unit, unit_b, near = np.zeros((m, 2)), np.empty(m), np.empty(m, np.bool_)

@@ -34,7 +34,7 @@ SHARP = 1e-3
 UNKNOWN = -1.0
 """The cost of a facet that has to be computed."""
 
-CANDIDATES = 4
+CANDIDATES = 3
 """Of the facets that could be dropped, this many, the smallest, are compared by the volume that they keep out."""
 
 
@@ -103,9 +103,11 @@ def merge(graph, n, lines, most, reach, at, frame, roof):
         f = _cheapest(graph, at, frame.y, roof)
         if f < 0:
             break
-        _, k = _raise(graph, f, at, frame.y, roof)
-        n = _build(graph, n, k, reach, frame, roof)
-        find_facets(graph.meets, n, at)
+        # From another vertex on, ties may be broken otherwise than when the cost was found.
+        roof.cost[f], k = _raise(graph, f, at, frame.y, roof)
+        if roof.cost[f] == np.inf:
+            continue
+        n = _build(graph, n, f, k, reach, at, frame, roof)
         for i in range(k):
             e = roof.around[i]
             roof.cost[e], roof.area[e] = UNKNOWN, _area(graph, e, at[e], frame.y)
@@ -190,6 +192,9 @@ def _raise(graph, f, at, y, roof):
         if i < 0 or not _is_inside(roof, i, left):
             return np.inf, k
         level, before, after = max(level, height[i]), before_in(i, left), after_in(i, left)
+        # Two facets of a polyhedron meet in one edge: round-off must not add another one.
+        if left > 3 and _meet_already(graph, ring[before], ring[after], at):
+            return np.inf, k
         for e, to in ((before, i), (i, after), (after, after_in(after, left))):
             total += _over_triangle(start[e], start[to], meet[i], base0, base1, base2)
         for j in range(3):
@@ -208,6 +213,20 @@ def _raise(graph, f, at, y, roof):
                 start[e, j], meet[e, j] = start[e + 1, j], meet[e + 1, j]
         new, left, changes = new + 1, left - 1, 2
         changed = before_in(i, left)
+
+
+@item
+@no_type_check
+def _meet_already(graph, f, other, at):
+    """Do two facets have an edge in common?"""
+    first, before, v = at[f], -1, at[f]
+    while True:
+        for j in range(3):
+            if graph.meets[v, j] == other:
+                return True
+        v, before = along(graph.meets, graph.near, v, before, f), v
+        if v == first:
+            return False
 
 
 @item
@@ -286,14 +305,14 @@ def _over_triangle(p, q, z, x0, x1, x2):
 
 @item
 @no_type_check
-def _build(graph, n, k, reach, frame, roof):
-    """Replace the k vertices around a facet by the k - 2 vertices of the roof found last. Returns the vertex count."""
+def _build(graph, n, f, k, reach, at, frame, roof):
+    """Replace the k vertices around facet f by the k - 2 vertices of the roof found last. Returns the vertex count."""
     points, meets, near = graph
-    size = len(points)
+    size, at[f] = len(points), -1
     for t in range(k - 2):
         v = roof.corner[t]
         for j in range(3):
-            frame.y[v, j], meets[v, j] = roof.apex[t, j], roof.of_apex[t, j]
+            frame.y[v, j], meets[v, j], at[roof.of_apex[t, j]] = roof.apex[t, j], roof.of_apex[t, j], v
             points[v, j] = frame.middle[j]
             for i in range(3):
                 points[v, j] += roof.apex[t, i] * frame.scale[i] * frame.axes[i, j]
@@ -305,7 +324,8 @@ def _build(graph, n, k, reach, frame, roof):
                 v, w = roof.corner[t], end // 3 if end < 3 * size else roof.corner[end // 3 - size]
                 near[v, j], near[w, end % 3] = w, v
     for v in (max(roof.corner[k - 1], roof.corner[k - 2]), min(roof.corner[k - 1], roof.corner[k - 2])):
-        for j in range(3):
-            frame.y[v, j] = frame.y[n - 1, j]
         n = take_out(graph, v, n)
+        if v < n:
+            for j in range(3):
+                frame.y[v, j], at[meets[v, j]] = frame.y[n, j], v
     return n

@@ -31,7 +31,7 @@ MAX_TIMES = 1_000_000
 """More times of a clock are a slip of the pen in its rate, or in somebody's stamps."""
 
 
-def read_bag(path: str | Path, bag: BagConfig, with_headings: bool = False) -> Log:
+def read_bag(path: str | Path, bag: BagConfig, with_headings: bool = False, in_space: bool = False) -> Log:
     """The log in a bag: a folder with metadata.yaml, or a single .mcap or .db3 file.
 
     Bodies whose stamps differ are resampled onto one clock, with bounds on the errors (`resampling`). Stamps since 1970
@@ -41,13 +41,14 @@ def read_bag(path: str | Path, bag: BagConfig, with_headings: bool = False) -> L
         path: the folder or file.
         bag: where the bodies are.
         with_headings: read the orientations of the poses, too.
+        in_space: robots are in space. Otherwise they are in the plane, and their height has to stay the same.
 
     Raises:
         LogError: the file cannot be read, or is not such a bag.
         ConfigError: `bag` names a topic or frame that is not in the bag, or a topic of another type.
     """
-    source = str(path)
-    content = _read(Path(path), bag)
+    source, n = str(path), 3 if in_space else 2
+    content = _read(Path(path), bag, n)
     frame = content.common_frame(bag)
     motions = {origin: content.motion(origin) for origin, _ in bag.origins}
     accelerations = {body: content.motion(f"topic {topic!r}") for topic, body in bag.accelerations.items()}
@@ -55,18 +56,19 @@ def read_bag(path: str | Path, bag: BagConfig, with_headings: bool = False) -> L
 
     def from_start(where: str, motion: Motion) -> Motion:
         motion = motion._replace(stamps=motion.stamps - start)
-        motion.require_numbers(f"{source}: {where}")
+        motion.require_numbers(f"{source}: {where}", n)
         return motion
 
     series = {}
     for topic, body in bag.accelerations.items():
         motion = from_start(f"topic {topic!r}", accelerations[body])
-        series[body] = Series(motion.stamps, motion.x[:, :2])
+        series[body] = Series(motion.stamps, motion.x[:, :n])
     tracks = []
     for origin, body in bag.origins:
         motion = from_start(origin, motions[origin])
-        motion.require_level(f"{source}: {origin}")
-        tracks.append(Track.of(body, motion if with_headings else motion._replace(heading=None), series.get(body)))
+        if not in_space:
+            motion.require_level(f"{source}: {origin}")
+        tracks.append(Track.of(body, motion if with_headings else motion._replace(heading=None), series.get(body), n))
     clock = None if bag.rate is None else _clock(tracks[0].stamps, bag.rate)
     radius = None if bag.radius is None else np.array([bag.radius[track.body] for track in tracks])
     log = log_of_tracks(source, tracks, clock, radius)
@@ -139,7 +141,7 @@ class _Content:
         return self.transforms.in_fixed(self.transforms.qualified(ordered[0].frame, name), motion, name)
 
 
-def _read(path: Path, bag: BagConfig) -> _Content:
+def _read(path: Path, bag: BagConfig, n: int) -> _Content:
     try:
         from rosbags.rosbag2 import Reader
         from rosbags.typesys import Stores, get_typestore
@@ -158,14 +160,14 @@ def _read(path: Path, bag: BagConfig) -> _Content:
                 types[connection.topic].add(connection.msgtype)
             if bag.fixed_frame is not None:
                 fixed = bag.fixed_frame.removeprefix("/")
-                content.transforms = Transforms(str(path), fixed, namespaces(types, TRANSFORMS))
+                content.transforms = Transforms(str(path), fixed, namespaces(types, TRANSFORMS), n)
             wanted = _wanted(path, types, bag)
             for connection, _, raw in reader.messages([c for c in reader.connections if c.topic in wanted]):
                 message: Any = decode(raw, connection.msgtype)
                 if connection.msgtype != TRANSFORMS:
                     origin = f"topic {connection.topic!r}"
                     where, multiple = f"{path}: {origin}", bag.covariance_multiple
-                    content.samples[origin].append(sample_of(where, connection.msgtype, message, multiple))
+                    content.samples[origin].append(sample_of(where, connection.msgtype, message, multiple, n))
                 elif content.transforms is not None:
                     content.transforms.add(connection.topic, message)
                 else:

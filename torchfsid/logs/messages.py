@@ -45,7 +45,7 @@ class Sample(NamedTuple):
     heading: float = math.nan
 
 
-def sample_of(where: str, kind: str, message: Any, multiple: float | None) -> Sample:
+def sample_of(where: str, kind: str, message: Any, multiple: float | None, n: int = 2) -> Sample:
     """The sample in a message of type ODOMETRY, POSE or ACCELERATION.
 
     Args:
@@ -53,6 +53,7 @@ def sample_of(where: str, kind: str, message: Any, multiple: float | None) -> Sa
         kind: the type.
         message: the message.
         multiple: number of standard deviations that bound the errors of an Odometry. None: no bounds.
+        n: errors count in the plane (2) or in space (3).
 
     Raises:
         LogError: an orientation is no unit quaternion, or a covariance is missing.
@@ -71,13 +72,15 @@ def sample_of(where: str, kind: str, message: Any, multiple: float | None) -> Sa
     if multiple is None:
         return Sample(stamp, frame, x, velocity, heading=turned)
     of_pose, of_twist = (
-        _covariance(where, name, of.covariance) for name, of in (("pose", message.pose), ("twist", message.twist))
+        _covariance(where, name, of.covariance, n) for name, of in (("pose", message.pose), ("twist", message.twist))
     )
-    yaw = math.sqrt(of_pose[5, 5]) if message.child_frame_id != header.frame_id else 0.0
-    position = multiple * _deviation(of_pose[:3, :3])
+    turning = of_pose[5:, 5:] if n == 2 else of_pose[3:, 3:]
+    turning = _deviation(turning) if message.child_frame_id != header.frame_id else 0.0
+    position = multiple * _deviation(of_pose[:n, :n])
     return Sample(
         stamp, frame, x, velocity, position,
-        multiple * (_deviation(turn @ of_twist[:3, :3] @ turn.T) + math.hypot(*velocity[:2]) * yaw), turned,
+        multiple * (_deviation((turn @ of_twist[:3, :3] @ turn.T)[:n, :n]) + math.hypot(*velocity[:n]) * turning),
+        turned,
     )  # fmt: skip
 
 
@@ -108,14 +111,14 @@ def _vector(message: Any) -> tuple[float, float, float]:
     return float(message.x), float(message.y), float(message.z)
 
 
-def _covariance(where: str, name: str, entries: Any) -> Float[np.ndarray, "6 6"]:
+def _covariance(where: str, name: str, entries: Any, n: int) -> Float[np.ndarray, "6 6"]:
     """A covariance as ROS writes it: 36 entries. All zeros, or a negative variance, mean that it is unknown."""
     matrix = np.array(entries, dtype=np.float64).reshape(6, 6)
-    if not (np.isfinite(matrix).all() and (np.diag(matrix) >= 0).all() and matrix[:2, :2].any()):
+    if not (np.isfinite(matrix).all() and (np.diag(matrix) >= 0).all() and matrix[:n, :n].any()):
         raise LogError(f"{where}: no covariance of the {name}: declare noise instead of bag.covariance_multiple")
     return matrix
 
 
-def _deviation(covariance: Float[np.ndarray, "3 3"]) -> float:
-    """The largest standard deviation in the plane."""
-    return math.sqrt(max(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]), 0.0))
+def _deviation(covariance: Float[np.ndarray, "k k"]) -> float:
+    """The largest standard deviation in any direction."""
+    return math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0))

@@ -1,4 +1,4 @@
-"""The measured motion of one body in space, and what the plane needs of it."""
+"""The measured motion of one body in space, and what robots in the plane need of it."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class Motion(NamedTuple):
         stamps: times [ns], increasing.
         x: positions [m].
         u: velocities [m/s], or None.
-        position_error: bounds on the errors of x in the plane [m].
-        velocity_error: bounds on the errors of u in the plane [m/s].
+        position_error: bounds on the errors of x [m]. They count in the plane only, for robots in the plane.
+        velocity_error: bounds on the errors of u [m/s]. Likewise.
         heading: directions of the body's x-axis in the plane [rad], NaN where unknown, or None.
     """
 
@@ -55,13 +55,13 @@ class Motion(NamedTuple):
         """A motion without errors."""
         return cls(stamps, x, u, np.zeros(len(stamps)), np.zeros(len(stamps)))
 
-    def require_numbers(self, where: str) -> None:
-        """Check that all is measurable in the plane.
+    def require_numbers(self, where: str, n: int) -> None:
+        """Check that all is measurable in the plane (n = 2) or in space (n = 3).
 
         Raises:
             LogError: it is not so.
         """
-        values = self.x[:, :2] if self.u is None else np.hstack([self.x[:, :2], self.u[:, :2]])
+        values = self.x[:, :n] if self.u is None else np.hstack([self.x[:, :n], self.u[:, :n]])
         measurable = is_measurable(values).all(axis=1)
         if not measurable.all():
             k = int(np.argmin(measurable))
@@ -76,7 +76,8 @@ class Motion(NamedTuple):
         """
         low, high = float(self.x[:, 2].min()), float(self.x[:, 2].max())
         if not high - low <= LEVEL:
-            raise LogError(f"{where}: robots in the plane only, but the height changes from {low:g} to {high:g} m")
+            told = "robots in the plane (a prior of two entries)"
+            raise LogError(f"{where}: {told}, but the height changes from {low:g} to {high:g} m")
 
 
 def rotation_of(x: float, y: float, z: float, w: float) -> Float[np.ndarray, "3 3"] | None:

@@ -1,9 +1,9 @@
 """Logs of motion capture, in the forms in which programs export them (`exports`).
 
 Cells that are empty are gaps. Rows that repeat another one exactly are left out and counted. With the y-axis up, the
-plane is (x, -z), seen from above. Bodies of one table have its times, and are missing where their cells are empty.
-Files of one body each have the same times if most of their times are shared with another file. Otherwise they are
-resampled (`resampling`). Times since 1970 are counted from the first.
+plane is (x, -z), seen from above, and positions in space are (x, -z, y). Bodies of one table have its times, and are
+missing where their cells are empty. Files of one body each have the same times if most of their times are shared with
+another file. Otherwise they are resampled (`resampling`). Times since 1970 are counted from the first.
 """
 
 from __future__ import annotations
@@ -28,13 +28,14 @@ SHARED = 0.5
 """Part of a body's times that another one has too, from which on their times are the same, with samples missing."""
 
 
-def read_motion_capture(path: str | Path, form: LogConfig, with_headings: bool = False) -> Log:
+def read_motion_capture(path: str | Path, form: LogConfig, with_headings: bool = False, in_space: bool = False) -> Log:
     """The log in an export of motion capture.
 
     Args:
         path: the file or folder.
         form: what the export is.
         with_headings: read the orientations, too.
+        in_space: robots are in space. Otherwise they are in the plane, and their height has to stay the same.
 
     Raises:
         LogError: a file cannot be read, or is not of that form. The message names the line.
@@ -42,21 +43,22 @@ def read_motion_capture(path: str | Path, form: LogConfig, with_headings: bool =
     """
     source, bodies = str(path), recorded(Path(path), form)
     start = start_of(int(of.stamps.min()) for of in bodies)
-    tracks, rounding = [], {"position": 0.0, "velocity": 0.0}
+    tracks, rounding, n = [], {"position": 0.0, "velocity": 0.0}, 3 if in_space else 2
     repeats: dict[str, int] = {}
     for of in bodies:
         first, times = _first_rows(of)
         repeats[of.table.source] = len(of.stamps) - len(first)
-        motion = _motion(of, first, times - start, form)
+        motion = _motion(of, first, times - start, form, n)
         if with_headings:
             motion = motion._replace(heading=_headings(of, first[np.isin(times - start, motion.stamps)], form))
         where = f"{of.table.source}: {of.body!r}"
         if len(motion.stamps) < 2:
             raise LogError(f"{where}: expected at least 2 samples, got {len(motion.stamps)}")
-        motion.require_level(where)
+        if not in_space:
+            motion.require_level(where)
         rounding["position"] = max(rounding["position"], float(motion.position_error.max()))
         rounding["velocity"] = max(rounding["velocity"], float(motion.velocity_error.max()))
-        tracks.append(Track.of(of.body, motion))
+        tracks.append(Track.of(of.body, motion, n=n))
     reading = Reading(
         rounding={name: size for name, size in rounding.items() if size > 0},
         duplicates=sum(repeats.values()),
@@ -82,8 +84,12 @@ def _first_rows(of: Recorded) -> tuple[np.ndarray, np.ndarray]:
     return kept, of.stamps[kept]
 
 
-def _motion(of: Recorded, rows: np.ndarray, stamps: np.ndarray, form: LogConfig) -> Motion:
+def _motion(of: Recorded, rows: np.ndarray, stamps: np.ndarray, form: LogConfig, n: int) -> Motion:
     scale, plane = 10.0**of.power, form.plane
+    for prefix in ("", "v") if n == 3 else ():
+        if f"{prefix}{plane[0]}" in of.columns and f"{prefix}{form.vertical}" not in of.columns:
+            missing = f"log.bodies.{of.body}.{prefix}{form.vertical}"
+            raise ConfigError(f"{missing}: required key is missing, robots are in space")
 
     def vectors(prefix: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The vectors (plane, height), where they are known, and bounds on their rounding."""
@@ -99,7 +105,7 @@ def _motion(of: Recorded, rows: np.ndarray, stamps: np.ndarray, form: LogConfig)
             column = names[int(np.argmax(empty[i]))]
             raise of.table.error(int(rows[i]), f"column {column!r} is empty, and others of {of.body!r} are not")
         values = np.nan_to_num(cells) * scale
-        rounding = half_units((text for name in there for text in of.table.texts(name)), values[:, :2], of.power)
+        rounding = half_units((text for name in there for text in of.table.texts(name)), values[:, :n], of.power)
         if form.vertical == "y":
             values = values * [1.0, -1.0, 1.0]
         return values, np.logical_not(empty.any(axis=1)), np.linalg.norm(rounding, axis=-1)
@@ -136,8 +142,8 @@ def _log(source: str, tracks: Sequence[Track], radius: Float[np.ndarray, "bodies
     shared = [float((count[np.searchsorted(stamps, track.stamps)] > 1).mean()) for track in tracks]
     if not in_one_table and len(tracks) > 1 and min(shared) < SHARED:
         return log_of_tracks(source, tracks, None, radius)
-    shape = len(stamps), len(tracks)
-    seen, x, u = np.zeros(shape, dtype=bool), np.zeros((*shape, 2)), np.zeros((*shape, 2))
+    shape, n = (len(stamps), len(tracks)), tracks[0].x.shape[-1]
+    seen, x, u = np.zeros(shape, dtype=bool), np.zeros((*shape, n)), np.zeros((*shape, n))
     heading = np.full(shape, np.nan)
     position_error, velocity_error, known = np.zeros(shape), np.zeros(shape), np.zeros(shape, dtype=bool)
     has_headings = any(track.heading is not None for track in tracks)

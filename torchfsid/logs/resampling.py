@@ -52,7 +52,7 @@ class Series:
     """
 
     stamps: Int[np.ndarray, "samples"]
-    values: Float[np.ndarray, "samples 2"]
+    values: Float[np.ndarray, "samples n"]
     error: Float[np.ndarray, "samples"] | None = None
 
 
@@ -74,8 +74,8 @@ class Track:
 
     body: str
     stamps: Int[np.ndarray, "samples"]
-    x: Float[np.ndarray, "samples 2"]
-    u: Float[np.ndarray, "samples 2"] | None
+    x: Float[np.ndarray, "samples n"]
+    u: Float[np.ndarray, "samples n"] | None
     acceleration: Series | None = None
     position_error: Float[np.ndarray, "samples"] | None = None
     velocity_error: Float[np.ndarray, "samples"] | None = None
@@ -83,11 +83,11 @@ class Track:
     command: Series | None = None
 
     @classmethod
-    def of(cls, body: str, motion: Motion, acceleration: Series | None = None) -> Track:
-        """The motion of a body in the plane."""
-        u = None if motion.u is None else motion.u[:, :2]
+    def of(cls, body: str, motion: Motion, acceleration: Series | None = None, n: int = 2) -> Track:
+        """The motion of a body in the plane (n = 2) or in space (n = 3)."""
+        u = None if motion.u is None else motion.u[:, :n]
         errors = [error if error.any() else None for error in (motion.position_error, motion.velocity_error)]
-        return cls(body, motion.stamps, motion.x[:, :2], u, acceleration, *errors, heading=motion.heading)
+        return cls(body, motion.stamps, motion.x[:, :n], u, acceleration, *errors, heading=motion.heading)
 
 
 @dataclass(frozen=True)
@@ -185,13 +185,13 @@ def seconds(stamps: Int[np.ndarray, "times"]) -> Float[np.ndarray, "times"]:
 class _Samples(NamedTuple):
     """One body on the clock. Entries are zero where the body is not seen or its velocity is unknown."""
 
-    x: Float[np.ndarray, "times 2"]
-    u: Float[np.ndarray, "times 2"]
+    x: Float[np.ndarray, "times n"]
+    u: Float[np.ndarray, "times n"]
     seen: Bool[np.ndarray, "times"]
     velocity_known: Bool[np.ndarray, "times"]
     position_error: Float[np.ndarray, "times"]
     velocity_error: Float[np.ndarray, "times"]
-    a: Float[np.ndarray, "times 2"]
+    a: Float[np.ndarray, "times n"]
     acceleration_known: Bool[np.ndarray, "times"]
     acceleration_error: Float[np.ndarray, "times"]
 
@@ -275,7 +275,7 @@ def _sample(track: Track, clock: Int[np.ndarray, "times"], differentiate: bool) 
             u_error = bound + (ends / (periods * 1e-9))[interval]
     else:
         known = seen if track.u is not None else np.zeros_like(seen)
-        u = np.zeros((len(clock), 2)) if track.u is None else at_clock(track.u, known)
+        u = np.zeros((len(clock), track.x.shape[-1])) if track.u is None else at_clock(track.u, known)
         u_error = 2 * weight * bound + errors_at_clock(track.velocity_error)
     return _Samples(
         x=at_clock(track.x, seen),
@@ -285,16 +285,16 @@ def _sample(track: Track, clock: Int[np.ndarray, "times"], differentiate: bool) 
         position_error=np.where(joined, weight * periods[interval] * 1e-9 * bound, 0.0)
         + errors_at_clock(track.position_error),
         velocity_error=np.where(known, u_error, 0.0),
-        **_accelerations(track.acceleration, clock),
+        **_accelerations(track.acceleration, clock, track.x.shape[-1]),
     )
 
 
-def _accelerations(series: Series | None, clock: Int[np.ndarray, "times"]) -> dict[str, np.ndarray]:
+def _accelerations(series: Series | None, clock: Int[np.ndarray, "times"], n: int) -> dict[str, np.ndarray]:
     """The accelerations on the clock. Zero where they are unknown."""
     names = ("a", "acceleration_known", "acceleration_error")
     if series is None:
         nothing = np.zeros(len(clock))
-        return dict(zip(names, (np.zeros((len(clock), 2)), nothing > 0, nothing), strict=True))
+        return dict(zip(names, (np.zeros((len(clock), n)), nothing > 0, nothing), strict=True))
     return dict(zip(names, _interpolated(series, clock), strict=True))
 
 
@@ -315,7 +315,7 @@ def _interpolated(series: Series, clock: Int[np.ndarray, "times"]) -> tuple[np.n
     return np.where(known[:, None], values, 0.0), known, np.where(known, error, 0.0)
 
 
-def _mean_velocities(track: Track) -> Float[np.ndarray, "intervals 2"]:
+def _mean_velocities(track: Track) -> Float[np.ndarray, "intervals n"]:
     with np.errstate(over="ignore"):
         return np.diff(track.x, axis=0) / (np.diff(track.stamps) * 1e-9)[:, None]
 

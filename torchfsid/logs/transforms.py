@@ -76,11 +76,13 @@ class Transforms:
         source: the bag, for messages.
         fixed: the fixed frame.
         namespaces: the namespaces that have a topic tf of their own.
+        n: errors count in the plane (2) or in space (3).
     """
 
     source: str
     fixed: str
     namespaces: frozenset[str]
+    n: int = 2
     _links: dict[str, _Link] = field(default_factory=dict)
 
     def qualified(self, frame: str, topic: str) -> str:
@@ -131,7 +133,7 @@ class Transforms:
         """
         while frame != self.fixed:
             link = self._link(frame, origin)
-            motion, frame = _moved(motion, link), link.parent
+            motion, frame = _moved(motion, link, self.n), link.parent
             if len(motion.stamps) == 0:
                 raise LogError(f"{self.source}: {origin!r} and the transforms of its frame share no time")
         return motion
@@ -158,7 +160,7 @@ class Transforms:
         return link
 
 
-def _moved(motion: Motion, link: _Link) -> Motion:
+def _moved(motion: Motion, link: _Link, n: int) -> Motion:
     """The motion in the parent's frame, without the samples at which the link is unknown."""
     if link.is_static:
         R, p = link.pose()
@@ -174,7 +176,7 @@ def _moved(motion: Motion, link: _Link) -> Motion:
     def between(values: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         a, b = (np.einsum("kij,kj->ki", R[k], values[inside]) + offsets[k] for k in (before, after))
         mean = (1 - part[:, None]) * a + part[:, None] * b
-        return mean, np.maximum(part, 1 - part) * np.linalg.norm((b - a)[:, :2], axis=-1)
+        return mean, np.maximum(part, 1 - part) * np.linalg.norm((b - a)[:, :n], axis=-1)
 
     x, x_error = between(motion.x, p)
     u, u_error = (None, 0.0) if motion.u is None else between(motion.u, np.zeros_like(p))

@@ -179,8 +179,7 @@ class SetMembershipObserver:
 
     Raises:
         InputError: the prior is not a batch (B,) over the task's parameters; `inverse_optimal` comes without `noise`;
-            `compiled` is True, but theta is not planar; `outliers` is negative, or
-            comes with windows or `reset`.
+            `outliers` is negative, or comes with windows or `reset`.
     """
 
     task: Task
@@ -205,10 +204,7 @@ class SetMembershipObserver:
         require_task(self.task)
         require_prior("feasible_set", self.feasible_set, self.task)
         require_choice("on_inconsistent", self.on_inconsistent, get_args(OnInconsistent))
-        p = self.feasible_set.dim
         self.model = ObservationModel(self.task, self.barriers, self.kind, self.noise, self.active_tolerance)
-        if self.compiled and p != 2:
-            raise InputError("compiled", "None or False unless theta is planar", True)
         self._windows = Windows(self.model, self.windows) if self.windows else None
         if self.outliers < 0 or (self.outliers and (self.windows or self.on_inconsistent == "reset")):
             expected = "0 with windows and where sets are reset" if self.outliers > 0 else "a number of samples"

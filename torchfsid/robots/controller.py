@@ -141,6 +141,8 @@ class CbfQpController:
         limit, shape = min(getattr(barrier, "speed_limit", math.inf) for barrier in self.barriers), control.u.shape[:-1]
         if limit == math.inf:
             return control
+        if safe_controls.dim != 2:
+            raise InputError("barriers", "a speed box instead of a ball, for controllers in space", self.barriers)
         rows = Halfspaces(
             safe_controls.A.expand(*shape, -1, -1).reshape(-1, safe_controls.rows, 2),
             safe_controls.b.expand(*shape, -1).reshape(-1, safe_controls.rows),

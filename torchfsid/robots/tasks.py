@@ -34,26 +34,26 @@ class Saturation:
 
     Attributes:
         shape: `norm` for |uhat| <= v, `box` for |uhat_i| <= v_i.
-        limits: the v_i, in the units of the control. For `norm` both are v. Infinite if there is a dead zone only.
+        limits: the v_i, in the units of the control. For `norm` all are v. Infinite if there is a dead zone only.
         dead_speed: the size below which the control is zero, in its units. For a goal it is the gain times the radius
             of the dead zone.
     """
 
     shape: Literal["norm", "box"]
-    limits: tuple[float, float]
+    limits: tuple[float, ...]
     dead_speed: float = 0.0
 
     def __post_init__(self) -> None:
         if not (min(self.limits) >= self.dead_speed >= 0 and min(self.limits) > 0):
             raise InputError("saturation", "positive limits >= dead_speed >= 0", (self.limits, self.dead_speed))
-        if self.shape == "norm" and self.limits[0] != self.limits[1]:
-            raise InputError("saturation.limits", "one limit, twice, for a norm", self.limits)
+        if self.shape == "norm" and min(self.limits) != max(self.limits):
+            raise InputError("saturation.limits", "the same limit for each axis, for a norm", self.limits)
 
     def scaled(self, factor: float) -> Saturation:
         """The saturation of `factor` times the control."""
-        return Saturation(self.shape, (factor * self.limits[0], factor * self.limits[1]), factor * self.dead_speed)
+        return Saturation(self.shape, tuple(factor * limit for limit in self.limits), factor * self.dead_speed)
 
-    def __call__(self, y: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
+    def __call__(self, y: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
         speed = y.square().sum(-1, keepdim=True).clamp(min=1e-300).sqrt()
         if self.shape == "norm":
             limit = self.limits[0]
@@ -109,6 +109,11 @@ def _identity_like(x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n n"]:
     return torch.eye(x.shape[-1], dtype=x.dtype, device=x.device).expand(*x.shape, x.shape[-1])
 
 
+def _named(name: str, dimension: int) -> tuple[str, ...]:
+    """The names of a vector's entries in the plane (2) or in space (3)."""
+    return tuple(f"{name}_{axis}" for axis in "xyz"[:dimension])
+
+
 def _velocity(measurement: Measurement) -> Float[Tensor, "*batch n"]:
     if measurement.velocity is None:
         raise InputError("measurement.velocity", "the velocities of the robots, of second order", None)
@@ -125,15 +130,14 @@ class GoalTask:
 
     Attributes:
         gain: the gain.
-        parameter_names: see `Task`.
+        dimension: 2 in the plane, 3 in space.
         saturation: how the nominal control is clipped.
         gain_error: a bound on the error of the gain.
-        damping: of the velocity v, before clipping [1/s].
-        loop: of the velocity v, after clipping [1/s] (`in_velocity_loop`).
+        damping, loop: of the velocity v, before and after clipping [1/s] (`in_velocity_loop`).
     """
 
     gain: float | Tensor
-    parameter_names: tuple[str, ...] = ("goal_x", "goal_y")
+    dimension: int = 2
     saturation: Saturation | None = None
     gain_error: float = 0.0
     damping: float = 0.0
@@ -145,9 +149,18 @@ class GoalTask:
             if not getattr(self, name) >= 0:
                 raise InputError(name, "a number >= 0", getattr(self, name))
 
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        return _named("goal", self.dimension)
+
     @classmethod
     def in_velocity_loop(
-        cls, gain: float, loop: float, saturation: Saturation | None = None, gain_error: float = 0.0
+        cls,
+        gain: float,
+        loop: float,
+        saturation: Saturation | None = None,
+        gain_error: float = 0.0,
+        dimension: int = 2,
     ) -> GoalTask:
         """Robots whose velocity follows a goal task: uhat = loop (clip(gain (theta - x)) - v), an acceleration.
 
@@ -156,9 +169,10 @@ class GoalTask:
             loop: of the velocity loop [1/s].
             saturation: of that velocity, limits in [m/s].
             gain_error: a bound on the error of the gain [1/s].
+            dimension: 2 in the plane, 3 in space.
         """
         scaled = None if saturation is None else saturation.scaled(loop)
-        return cls(loop * gain, saturation=scaled, gain_error=loop * gain_error, loop=loop)
+        return cls(loop * gain, dimension, scaled, loop * gain_error, loop=loop)
 
     @property
     def uncertain(self) -> bool:
@@ -188,8 +202,12 @@ class GoalTask:
 class UnknownGainGoalTask:
     """Go to a goal with an unknown gain: uhat = k (x_d - x) is linear in theta = (k, k x_d), so C = [-x  I], d = 0."""
 
-    parameter_names: tuple[str, ...] = ("gain", "gain_goal_x", "gain_goal_y")
+    dimension: int = 2
     saturation: Saturation | None = None
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        return ("gain", *_named("gain_goal", self.dimension))
 
     def __call__(self, measurement: Measurement) -> Affine:
         x = measurement.x
@@ -203,8 +221,12 @@ class UnknownGainGoalTask:
 class VelocityTask:
     """Keep a constant velocity theta [m/s]: uhat = theta."""
 
-    parameter_names: tuple[str, ...] = ("velocity_x", "velocity_y")
+    dimension: int = 2
     saturation: Saturation | None = None
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        return _named("velocity", self.dimension)
 
     def __call__(self, measurement: Measurement) -> Affine:
         return _identity_like(measurement.x), torch.zeros_like(measurement.x)
@@ -222,8 +244,12 @@ class FormationTask:
 
     gain: float | Tensor
     leader: int
-    parameter_names: tuple[str, ...] = ("offset_x", "offset_y")
+    dimension: int = 2
     saturation: Saturation | None = None
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        return _named("offset", self.dimension)
 
     def __post_init__(self) -> None:
         _positive("gain", self.gain)
@@ -239,7 +265,7 @@ class FormationTask:
 
 @dataclass(frozen=True)
 class OrbitTask:
-    """Circle a centre theta [m] at a known angular rate [rad/s]: uhat = rate J (x - theta), J a turn by 90 deg."""
+    """Circle a centre theta [m] in the plane at a known rate [rad/s]: uhat = rate J (x - theta), J a turn by 90 deg."""
 
     rate: float | Tensor
     parameter_names: tuple[str, ...] = ("centre_x", "centre_y")
@@ -257,12 +283,13 @@ class OrbitTask:
 class PatrolTask:
     """Follow a closed path r(t) = c + sum_k (a_k cos(k w t) + b_k sin(k w t)), w the `rate` [rad/s].
 
-    The nominal control uhat = gain (r - x) + dr/dt is linear in theta = (c, a_1, b_1, ...) [m], p = 2 + 4 `harmonics`.
+    uhat = gain (r - x) + dr/dt is linear in theta = (c, a_1, b_1, ...) [m], p = `dimension` (1 + 2 `harmonics`).
     """
 
     gain: float
     rate: float
     harmonics: int = 1
+    dimension: int = 2
     saturation: Saturation | None = None
 
     def __post_init__(self) -> None:
@@ -271,8 +298,8 @@ class PatrolTask:
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        waves = [f"{wave}{k}_{axis}" for k in range(1, self.harmonics + 1) for wave in ("cos", "sin") for axis in "xy"]
-        return ("centre_x", "centre_y", *waves)
+        waves = [f"{wave}{k}" for k in range(1, self.harmonics + 1) for wave in ("cos", "sin")]
+        return tuple(name for part in ("centre", *waves) for name in _named(part, self.dimension))
 
     def __call__(self, measurement: Measurement) -> Affine:
         identity = _identity_like(measurement.x)

@@ -57,7 +57,7 @@ def check_barrier(
     motion: Callable[[Measurement, float], Measurement] = first_order,
     seed: int = 0,
 ) -> None:
-    """Run all checks of this module. Where controls are not planar, there are no sets to be checked.
+    """Run all checks of this module, in the plane or in space.
 
     Args:
         barrier: any object with the members of `Barrier`.
@@ -74,7 +74,7 @@ def check_barrier(
     situations = random_situations(seed) if situations is None else situations
     checks: list[Callable[[Barrier, Measurement, int], None]]
     checks = [check_labels, check_padding, check_batch, check_errors, check_left_out]
-    if situations.x.shape[-1] == 2:
+    if situations.x.shape[-1] in (2, 3):
         checks += [check_soundness, check_compiled]
     if h is not None and alpha is not None:
         checks.append(lambda *args: check_derivative(*args, h=h, alpha=alpha, motion=motion))
@@ -271,7 +271,7 @@ def _readings(
     for size in (0.0, *SIZES):
         true, theta = motions(barrier, repeated(situations), draw)
         seen, noise = measured(true, size, draw)
-        model, corner = ObservationModel(VelocityTask(), [barrier], noise=noise), theta.abs() + 1
+        model, corner = ObservationModel(VelocityTask(theta.shape[-1]), [barrier], noise=noise), theta.abs() + 1
         read = partial(evidence, model, FeasibleSet.from_box(-corner, corner), seen)
         yield f"{check}: errors up to {size},", true, theta, read
 

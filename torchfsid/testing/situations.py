@@ -132,7 +132,7 @@ def motions(barrier: Barrier, situations: Measurement, draw: torch.Generator) ->
     Robots whose QP has no solution are left out, unless they take the least violation (`Barrier.relaxes`).
     """
     wish = 0.1 * (5 * uniform(situations.x[:, :1], draw)).exp() * direction(situations.x, draw)
-    control = CbfQpController(VelocityTask(), [barrier])(replace(situations, u=None), wish)
+    control = CbfQpController(VelocityTask(situations.x.shape[-1]), [barrier])(replace(situations, u=None), wish)
     moves = control.feasible | (control.u != 0).any(-1)
     return replace(situations, u=control.u).select(moves), wish[moves]
 
