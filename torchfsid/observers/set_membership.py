@@ -127,9 +127,9 @@ class SetEstimates:
     def of(cls, estimate: SetEstimate) -> SetEstimates:
         """An estimate as those of one time."""
         return cls(
-            torch.tensor([estimate.t], dtype=torch.float64),
+            torch.tensor([estimate.t], dtype=torch.float64, device=estimate.status.device),
             estimate.feasible_set,
-            torch.arange(len(estimate.status)).unsqueeze(0),
+            torch.arange(len(estimate.status), device=estimate.status.device).unsqueeze(0),
             estimate.evidence,
             estimate.informative.unsqueeze(0),
             estimate.status.unsqueeze(0),
@@ -148,7 +148,10 @@ class SetEstimates:
         sets, evidence, (samples, robots) = self.sets, self.evidence, self.which.shape
         if samples > 1:
             place = range(samples)[s] * robots
-            sets, evidence = sets.select(self.which[s]), evidence.select(torch.arange(place, place + robots))
+            sets, evidence = (
+                sets.select(self.which[s]),
+                evidence.select(torch.arange(place, place + robots, device=self.status.device)),
+            )
         return SetEstimate(self.t.tolist()[s], sets, evidence, self.informative[s], self.status[s], self.safety)
 
 
