@@ -27,7 +27,7 @@ demo: $(STAMP)
 	$(BIN)/python -m experiments run $(DEMO) --out $(DEMO_OUT)
 	@echo "Figures and results are in $(DEMO_OUT)/:" && ls $(DEMO_OUT)
 
-test: lint
+test: lint docs
 	$(BIN)/pytest -n 2 --dist loadfile
 
 lint: $(STAMP)

@@ -1,5 +1,6 @@
 """ROS bags, real ones: what is read is what a CSV log of the same motion says; what is wrong is one clear line."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -201,7 +202,9 @@ def test_observe_gives_the_same_regions_as_from_csv(csv_log, tmp_path, capsys):
         out = tmp_path / "out" / log
         arguments = ["observe", str(tmp_path / log), "--config", str(tmp_path / "config.yaml"), "--out", str(out)]
         assert main(arguments) == 0
-        results.append([(out / name).read_bytes() for name in ("regions.json", "estimates.csv", "config.yaml")])
+        found = json.loads((out / "regions.json").read_text())
+        assert found.pop("made_from")["log"] == str(tmp_path / log)
+        results.append([found, *((out / name).read_bytes() for name in ("estimates.csv", "config.yaml"))])
     assert results[0] == results[1]
 
     capsys.readouterr()
