@@ -59,10 +59,14 @@ def times_of(samples: Measurement, robots: int) -> Float[Tensor, "S"]:
     """
     items = len(samples.x)
     if samples.x.ndim == 2 and items == robots:
-        return torch.tensor([samples.time], dtype=torch.float64)
+        return torch.tensor([samples.time], dtype=torch.float64, device=samples.x.device)
     if samples.x.ndim != 2 or robots == 0 or items == 0 or items % robots != 0:
         raise InputError("measurement", f"samples of {robots} robots, concatenated", tuple(samples.x.shape))
-    times = torch.as_tensor(samples.t, dtype=torch.float64).expand(items).unflatten(0, (-1, robots))
+    times = (
+        torch.as_tensor(samples.t, dtype=torch.float64, device=samples.x.device)
+        .expand(items)
+        .unflatten(0, (-1, robots))
+    )
     if not bool((times == times[:, :1]).all()):
         raise InputError("measurement.t", "one time for all robots of a sample", "different times")
     return times[:, 0]
@@ -88,8 +92,7 @@ class Course:
         parts: sets Theta, each a batch (k,): those before the samples, and those that followed.
         which: for each sample and robot, the place of Theta after the sample in all `parts` one after the other.
         explained: whether a parameter of Theta explains the sample.
-        lost: whether the sample emptied the last level.
-        proofs: for each (sample, robot) that did, what `proof` says of the empty set.
+        proofs: for each (sample, robot) that emptied the last level, what `proof` says of the empty set.
     """
 
     levels: Levels
@@ -98,7 +101,6 @@ class Course:
     parts: list[FeasibleSet] = field(init=False)
     which: Int[Tensor, "S B"] = field(init=False)
     explained: Bool[Tensor, "S B"] = field(init=False)
-    lost: Bool[Tensor, "S B"] = field(init=False)
     proofs: dict[tuple[int, int], tuple] = field(init=False, default_factory=dict)
 
     def run(self, prior: FeasibleSet | None, proof: Callable[[FeasibleSet, int], tuple]) -> None:
@@ -109,16 +111,15 @@ class Course:
             proof: called with the sets and the robot, where a set is empty.
         """
         samples, robots = len(self.t), self.levels[-1].batch_shape[0]
-        every, now = torch.arange(robots), torch.zeros(robots, dtype=torch.long)
-        self.lost = torch.zeros(samples, robots, dtype=torch.bool)
+        device = self.levels[-1].outcome.device
+        every = torch.arange(robots, device=device)
         if samples == 1:  # no search: all robots are cut at once
-            explains, theta = self._cut(self.omega, self.t.expand(robots), now, prior, proof)
+            explains, theta = self._cut(self.omega, float(self.t), None, prior, proof)
             self.parts, self.which, self.explained = [theta], every.unsqueeze(0), explains.unsqueeze(0)
             return
-        self.omega = self.omega.shortened()
-        self.parts, self.which = [self.levels[-1]], every.repeat(samples, 1)
-        self.explained = torch.ones_like(self.lost)
-        which, explained, known = self.which.numpy(), self.explained.numpy(), robots
+        self.omega, now = self.omega.shortened(), torch.zeros_like(every)
+        self.parts, known = [self.levels[-1]], robots
+        which, explained = np.tile(np.arange(robots), (samples, 1)), np.ones((samples, robots), dtype=np.bool_)
         while bool((cut := (now := self._next_cuts(now)) < samples).any()):
             items = now.clamp(max=samples - 1) * robots + every
             omega = self.omega.select(items).where(cut.unsqueeze(-1))
@@ -126,21 +127,29 @@ class Course:
             changed = cut.nonzero().flatten()
             self.parts.append(theta.select(changed))
             for robot, sample in zip(changed.tolist(), now[changed].tolist(), strict=True):
-                which[sample:, robot], explained[sample, robot], known = known, explains[robot], known + 1
+                which[sample:, robot], explained[sample, robot], known = known, bool(explains[robot]), known + 1
             now = torch.where(cut, now + 1, samples)
+        self.which, self.explained = (torch.from_numpy(part).to(device) for part in (which, explained))
 
     def _cut(
-        self, omega: Halfspaces, t: Tensor, now: Tensor, prior: FeasibleSet | None, proof: Callable
+        self, omega: Halfspaces, t: float | Tensor, now: Tensor | None, prior: FeasibleSet | None, proof: Callable
     ) -> tuple[Bool[Tensor, "B"], FeasibleSet]:
-        """Cut the sets by the samples `now` of the robots. Returns whether they are explained, and Theta."""
+        """Cut the sets by the samples `now` of the robots (None: the first). Returns `explained` of them, and Theta."""
         (*below, theta), explained = narrowed(self.levels, omega, t)
         if theta.any_empty:
             for robot in theta.is_empty.nonzero().flatten().tolist():
-                self.lost[now[robot], robot] = True
-                self.proofs[int(now[robot]), robot] = proof(theta, robot)
+                self.proofs[0 if now is None else int(now[robot]), robot] = proof(theta, robot)
             theta = theta.where(~theta.is_empty, self.levels[-1] if prior is None else prior)
         self.levels = (*below, theta)
         return explained, theta
+
+    @property
+    def lost(self) -> Bool[Tensor, "S B"]:
+        """Where a sample emptied the last level."""
+        found = torch.zeros_like(self.explained)
+        for place in self.proofs:
+            found[place] = True
+        return found
 
     def _next_cuts(self, start: Int[Tensor, "B"]) -> Int[Tensor, "B"]:
         """For each robot the first sample, from `start` on, of which some row cuts some level. S if there is none."""
@@ -152,19 +161,19 @@ class Course:
         return found
 
     def _next_cut_of(self, level: FeasibleSet, start: Int[Tensor, "B"]) -> Int[Tensor, "B"]:
-        samples, robots = self.which.shape
+        samples, robots = len(self.t), len(start)
         if level.dim == 2:
             polygons = map(array, (level.body.corners, level.body.count, level.body.reach))
-            return torch.from_numpy(first_cuts(*polygons, *self._rows, array(start)))
+            return torch.from_numpy(first_cuts(*polygons, *self._rows, array(start))).to(start.device)
         rows, _ = by_robot(self.omega, 0.0, robots)
         cuts = (reach(rows, level) > rows.b).unflatten(-1, (samples, -1)).any(-1)
-        cuts = cuts & (torch.arange(samples) >= start.unsqueeze(-1))
+        cuts = cuts & (torch.arange(samples, device=start.device) >= start.unsqueeze(-1))
         return torch.where(cuts.any(-1), cuts.int().argmax(-1), samples)
 
     @cached_property
     def _rows(self) -> tuple[np.ndarray, np.ndarray]:
-        shape = (*self.which.shape, -1)
-        return array(self.omega.A.unflatten(0, shape[:2])), array(self.omega.b.unflatten(0, shape[:2]))
+        shape = len(self.t), -1
+        return array(self.omega.A.unflatten(0, shape)), array(self.omega.b.unflatten(0, shape))
 
 
 def joined(parts: Sequence[FeasibleSet]) -> FeasibleSet:

@@ -76,8 +76,7 @@ def narrowed(levels: Levels, omega: Halfspaces, t: float | Float[Tensor, "B"]) -
 
     A level is EMPTY if no parameter is left of it.
     """
-    times = torch.as_tensor(t, dtype=torch.float64).expand(levels[0].batch_shape)
-    stamp = times.unsqueeze(-1)
+    stamp = t.unsqueeze(-1) if isinstance(t, Tensor) else t
     found = [levels[0].intersect(omega, stamp)]
     found += [level.intersect(moved_around(omega, below), stamp) for below, level in pairwise(levels)]
     explained = ~found[-1].is_empty
@@ -89,7 +88,8 @@ def narrowed(levels: Levels, omega: Halfspaces, t: float | Float[Tensor, "B"]) -
         suspect = omega.where(emptied.unsqueeze(-1))
         for j, (below, level) in enumerate(pairwise(levels), start=1):
             explained = ~level.intersect(suspect, stamp).is_empty
-            shifted = replace(below, last_cut=times)
+            times = torch.as_tensor(t, dtype=torch.float64, device=below.last_cut.device)
+            shifted = replace(below, last_cut=times.expand_as(below.last_cut))
             found[j] = found[j].where(explained | below.is_empty, shifted)
     return tuple(found), explained
 

@@ -127,9 +127,9 @@ class SetEstimates:
     def of(cls, estimate: SetEstimate) -> SetEstimates:
         """An estimate as those of one time."""
         return cls(
-            torch.tensor([estimate.t], dtype=torch.float64),
+            torch.tensor([estimate.t], dtype=torch.float64, device=estimate.status.device),
             estimate.feasible_set,
-            torch.arange(len(estimate.status)).unsqueeze(0),
+            torch.arange(len(estimate.status), device=estimate.status.device).unsqueeze(0),
             estimate.evidence,
             estimate.informative.unsqueeze(0),
             estimate.status.unsqueeze(0),
@@ -148,8 +148,11 @@ class SetEstimates:
         sets, evidence, (samples, robots) = self.sets, self.evidence, self.which.shape
         if samples > 1:
             place = range(samples)[s] * robots
-            sets, evidence = sets.select(self.which[s]), evidence.select(torch.arange(place, place + robots))
-        return SetEstimate(float(self.t[s]), sets, evidence, self.informative[s], self.status[s], self.safety)
+            sets, evidence = (
+                sets.select(self.which[s]),
+                evidence.select(torch.arange(place, place + robots, device=self.status.device)),
+            )
+        return SetEstimate(self.t.tolist()[s], sets, evidence, self.informative[s], self.status[s], self.safety)
 
 
 @dataclass
@@ -254,12 +257,9 @@ class SetMembershipObserver:
         found = read(self.feasible_set, samples, self.compiled)
         course = Course((*self._below, self.feasible_set), possible(found) if self.outliers else found.omega, times)
         course.run(self.prior if reset else None, contradicting)
-        alarmed, lost = found.alarmed.view(shape), course.lost
-        if self.outliers:  # alarms among outliers empty a level, those beyond the q the last one
-            alarmed, lost = alarmed & lost, lost & ~alarmed
         status = self.status.expand(shape)
-        if bool(alarmed.any()) or bool(lost.any()):
-            status = self._report(times, alarmed, lost, found.slack, course)
+        if course.proofs or bool(found.alarmed.any()):
+            status = self._report(times, found, course)
         *below, self.feasible_set = course.levels
         self._below, self.status = tuple(below), status[-1]
         informative = found.informative.view(shape)
@@ -285,20 +285,23 @@ class SetMembershipObserver:
         """The samples that are left unexplained, robot by robot, in the order of time."""
         return set_aside((*self._below, self.feasible_set))
 
-    def _report(self, times: Tensor, alarmed: Tensor, lost: Tensor, slack: Tensor, course: Course) -> Tensor:
+    def _report(self, times: Tensor, found: Evidence, course: Course) -> Tensor:
         """Record what went wrong for the first time. Returns the status after each sample.
 
         Raises:
             InconsistentError: a set is empty, and that is asked for. If there are several samples, nothing was changed.
         """
-        reset, robots = self.on_inconsistent == "reset", len(self.status)
+        reset, robots, lost = self.on_inconsistent == "reset", len(self.status), course.lost
+        alarmed = found.alarmed.view(lost.shape)
+        if self.outliers:  # alarms among outliers empty a level, those beyond the q the last one
+            alarmed, lost = alarmed & lost, lost & ~alarmed
         raised = torch.where(alarmed, int(Status.ALARM), self.status)
         raised = raised if reset else torch.where(lost, int(Status.INCONSISTENT), raised)
         status = torch.maximum(raised.cummax(0).values, self.status)
         before = torch.cat([self.status.unsqueeze(0), status[:-1]])
         events = []
         for s, robot in (alarmed & (before < Status.ALARM)).nonzero().tolist():
-            row = int(slack[s * robots + robot].argmin())
+            row = int(found.slack[s * robots + robot].argmin())
             events.append((s, Event(float(times[s]), robot, Status.ALARM, ((float(times[s]), row),))))
         for s, robot in (lost & (before < Status.INCONSISTENT)).nonzero().tolist():
             proof = course.proofs[s, robot]
