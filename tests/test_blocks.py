@@ -12,6 +12,7 @@ import torch
 from tests.filters import TEAM_BARRIERS, TEAM_GOALS, TEAM_STARTS, TEAM_TASK
 from torchfsid.errors import InconsistentError, InputError
 from torchfsid.observers.blocks import depends_on_theta
+from torchfsid.observers.fleet import FleetObserver
 from torchfsid.observers.hybrid import HybridObserver
 from torchfsid.observers.set_membership import SetEstimate, SetMembershipObserver
 from torchfsid.observers.ukf import ParameterUkf
@@ -233,3 +234,22 @@ def test_wrong_blocks_are_refused() -> None:
         list(made().read(several.select(torch.tensor([0, 5, 1, 4, 2, 6, 3, 7]))))
     with pytest.raises(InputError, match="4 robots"):
         made().update(several)
+
+
+def test_a_bound_for_each_robot() -> None:
+    """In blocks, and in the parts of a fleet, each robot has its own."""
+    bounds = torch.tensor([0.01, 0.2, 0.05, 0.01], dtype=torch.float64)
+    samples = team(3, broken=False)
+    for noise in (NoiseBound(bounds), NoiseBound(ERROR, bounds), NoiseBound(bounds, position=RHO)):
+        one_by_one, in_blocks, alone = made(noise=noise), made(noise=noise), made(noise=noise)
+        fleets = [FleetObserver(alone, threads=threads) for threads in (2, 4)]
+        for sample in samples:
+            one_by_one.update(sample)
+            for fleet in fleets:
+                fleet.update(sample)
+        assert sum(len(found) for block in blocks(samples, 20) for found in in_blocks.read(block)) == SAMPLES
+        assert_same(in_blocks, one_by_one)
+        for fleet in fleets:
+            assert_same_sets(fleet.feasible_set, one_by_one.feasible_set)
+    with pytest.raises(InputError, match="a bound for each of 4 robots"):
+        made(noise=NoiseBound(bounds[:3])).update(samples[0])

@@ -222,16 +222,16 @@ def sample_of(model: ObservationModel, theta: FeasibleSet, measurement: Measurem
     if measurement.x.ndim != 2 or len(theta.batch_shape) != 1 or items % max(robots, 1) != 0:
         expected = f"a batch of {tuple(theta.batch_shape)} robots, or several of them"
         raise InputError("measurement", expected, tuple(measurement.x.shape))
-    errors, of_rows, corners = ErrorBounds.of(measurement, model.noise), None, None
+    noise = NoiseBound(0.0, model.active_tolerance) if model.noise is None else model.noise.of_samples(robots, items)
+    errors, of_rows, corners = ErrorBounds.of(measurement, noise), None, None
     if errors is None and any(getattr(barrier, "uncertain", False) for barrier in model.barriers):
-        errors = ErrorBounds.of_controls(measurement, model.noise)
+        errors = ErrorBounds.of_controls(measurement, noise)
     parts = [possible_rows(barrier, measurement, errors) for barrier in model.barriers]
     rows, (C, d) = Halfspaces.stack(parts), model.task(measurement)
     owners = [barrier for barrier, part in zip(model.barriers, parts, strict=True) for _ in range(part.rows)]
     hard = torch.tensor([not barrier.soft for barrier in owners], dtype=torch.bool, device=u.device)
     relaxed = torch.tensor([getattr(b, "relaxes", False) for b in owners], dtype=torch.bool, device=u.device)
 
-    noise = NoiseBound(0.0, model.active_tolerance) if model.noise is None else model.noise
     bound, ball, drift = per_row(noise.slack, u), per_row(noise.velocity, u).squeeze(-1), u.new_zeros(())
     if measurement.velocity_error is not None:
         bound, ball = bound + measurement.velocity_error.unsqueeze(-1), ball + measurement.velocity_error

@@ -192,7 +192,7 @@ class LearningModel:
         within = model.barriers[place]
         assert isinstance(within, AvoidanceWithin)
         first = sum(model.barriers[i](measurement).rows for i in range(place))
-        rows = within.safety_rows(measurement, *self._bounds(measurement))
+        rows = within.safety_rows(measurement, *self._bounds(measurement, robots))
         undecided = rows.undecided & found.informative.unsqueeze(-1)
         if theta.any_empty:
             undecided = undecided & ~theta.is_empty.repeat(len(measurement.x) // max(robots, 1)).unsqueeze(-1)
@@ -201,9 +201,10 @@ class LearningModel:
         kept = rows.cuts & found.informative.unsqueeze(-1) & (not self.unknown.soft)
         return Reading(theta, _cuts(rows, kept, must, found.slack.shape[-1], first), found, undecided & ~must, rows)
 
-    def _bounds(self, measurement: Measurement) -> tuple[ErrorBounds, Tensor]:
-        errors = ErrorBounds.of(measurement, self.noise) or ErrorBounds.none(measurement)
-        slack = per_row(self.noise.slack, measurement.x)
+    def _bounds(self, measurement: Measurement, robots: int) -> tuple[ErrorBounds, Tensor]:
+        noise = self.noise.of_samples(robots, len(measurement.x))
+        errors = ErrorBounds.of(measurement, noise) or ErrorBounds.none(measurement)
+        slack = per_row(noise.slack, measurement.x)
         if measurement.velocity_error is not None:
             slack = slack + measurement.velocity_error.unsqueeze(-1)
         return errors, slack

@@ -43,7 +43,8 @@ def depends_on_theta(model: ObservationModel, measurement: Measurement) -> bool:
     """
     if model.task.saturation is not None or getattr(model.task, "uncertain", False):
         return True
-    errors = ErrorBounds.of(measurement, model.noise)
+    noise = model.noise and replace(model.noise, velocity=0.0, slack=0.0)  # no drift depends on them
+    errors = ErrorBounds.of(measurement, noise)
     if errors is None:
         return False
     nothing = measurement.x.new_zeros(len(measurement.x), len(model.task.parameter_names))

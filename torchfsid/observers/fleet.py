@@ -81,7 +81,7 @@ class FleetObserver:
         if observer.feasible_set is not observer.prior or observer.events or bool(observer.skipped.any()):
             raise InputError("observer", "one that has seen no measurement", observer.events or "others")
         places = torch.arange(robots).tensor_split(max(1, min(threads, robots)))
-        self.parts = tuple(replace(observer, feasible_set=observer.feasible_set.select(items)) for items in places)
+        self.parts = tuple(_part(observer, items) for items in places)
         self._slices = [slice(int(items[0]), int(items[-1]) + 1) if len(items) else slice(0) for items in places]
 
     def update(self, measurement: Measurement) -> FleetEstimate:
@@ -125,6 +125,11 @@ class FleetObserver:
         parts = zip(self.parts, self._slices, strict=True)
         found = [replace(event, robot=items.start + event.robot) for part, items in parts for event in part.events]
         return sorted(found, key=lambda event: (event.t, event.robot))
+
+
+def _part(observer: SetMembershipObserver, robots: Int[Tensor, "k"]) -> SetMembershipObserver:
+    noise = None if observer.noise is None else observer.noise.select(robots)
+    return replace(observer, feasible_set=observer.feasible_set.select(robots), noise=noise)
 
 
 def _update(part: SetMembershipObserver, measurement: Measurement, items: slice, gradients: bool) -> SetEstimate:

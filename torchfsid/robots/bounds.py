@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchfsid.errors import InputError
 from torchfsid.robots.arguments import require_numbers
 from torchfsid.robots.measurement import Measurement
 
@@ -60,6 +61,35 @@ class NoiseBound:
         for name, bound in bounds.items():
             require_numbers(f"noise.{name}", "a bound >= 0", bound, lambda size: size >= 0)
             object.__setattr__(self, name, bound)
+
+    def select(self, robots: Int[Tensor, "k"]) -> NoiseBound:
+        """The bounds of some robots."""
+
+        def of_these(bound: float | Tensor) -> float | Tensor:
+            return bound[robots] if isinstance(bound, Tensor) and bound.ndim > 0 else bound
+
+        return self._with(of_these(self.velocity), of_these(self.slack))
+
+    def of_samples(self, robots: int, items: int) -> NoiseBound:
+        """The bounds of all `items` of one or several samples of these robots, concatenated.
+
+        Raises:
+            InputError: there are bounds for each robot, of another number of robots.
+        """
+
+        def repeated(bound: float | Tensor) -> float | Tensor:
+            if not isinstance(bound, Tensor) or bound.ndim != 1 or len(bound) in (1, items):
+                return bound
+            if len(bound) != robots:
+                raise InputError("noise", f"a bound for each of {robots} robots, or one for all", tuple(bound.shape))
+            return bound.repeat(items // max(robots, 1))
+
+        return self._with(repeated(self.velocity), repeated(self.slack))
+
+    def _with(self, velocity: float | Tensor, slack: float | Tensor) -> NoiseBound:
+        if velocity is self.velocity and slack is self.slack:
+            return self
+        return replace(self, velocity=velocity, slack=slack)
 
 
 class ErrorBounds(NamedTuple):
