@@ -188,3 +188,15 @@ def test_flat_sets_are_merged_to_few_facets_without_growing_much(p: int) -> None
         assert theta.diameter() <= diameter * 1.01
         assert theta.volume() == 0
     assert theta.diameter() < 1.5 * SIDE
+
+
+def test_a_set_as_small_as_round_off_has_a_ball() -> None:
+    """The rows that are left of it are open on one side."""
+    rng, centre = np.random.default_rng(279), np.full(3, 1e6)
+    found = FeasibleSet.from_box(torch.tensor(centre - 1e-6), torch.tensor(centre + 1e-6))
+    for _ in range(3):
+        A = rng.normal(size=(6, 3))
+        found = found.intersect(Halfspaces(torch.tensor(A), torch.tensor(A @ centre + 1e-12)))
+    middle, radius = found.chebyshev()
+    assert bool(found.contains(middle))
+    assert 0 <= float(radius) < 1e-6

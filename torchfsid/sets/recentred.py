@@ -33,7 +33,8 @@ def chebyshev(
     """
     rows = Halfspaces(A, b - times(A, middle))
     centre, radius, status = inscribed_ball(rows)
-    flat, lost = radius <= FLAT * reach.amax(-1), status == Status.UNSOLVED
+    # The rows of a set as small as round-off need not bound it.
+    flat, lost = radius <= FLAT * reach.amax(-1), (status == Status.UNSOLVED) | (status == Status.UNBOUNDED)
     if bool(lost.any()):
         radius = torch.where(lost, rows.slack(torch.zeros_like(centre)).amin(-1).clamp(min=0.0), radius)
     centre = middle + torch.where((flat | lost).unsqueeze(-1), 0.0, centre)
