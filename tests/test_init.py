@@ -1,6 +1,7 @@
 """`torchfsid init`: what it writes for a log is valid at once, says what the log says, and names what to edit."""
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -248,8 +249,8 @@ def test_what_is_no_log_is_one_line(tmp_path, capsys, content, expected):
 
 
 def test_names_that_yaml_reads_as_something_else(tmp_path):
-    """Names stay names: numbers, truth values, quotes and what is not ASCII."""
-    names = ["010", "no", 'a"b: #', "Ω", "1e3"]
+    """Names stay names: numbers, truth values, quotes, line breaks and what is not ASCII."""
+    names = ["010", "no", 'a"b: #', "Ω", "1e3", "two\nlines: [", "</script>"]
     log = tmp_path / "log.csv"
     rows = [
         f'{k},"{name.replace(chr(34), chr(34) * 2)}",{j + (k if j < 1 else 0)},0'
@@ -260,3 +261,27 @@ def test_names_that_yaml_reads_as_something_else(tmp_path):
     model, text = started(log, tmp_path)
     assert model.obstacles == tuple(names[1:])
     assert yaml.safe_load(text)["obstacles"] == names[1:]
+
+
+def test_far_from_the_origin(run, tmp_path):
+    """In metres of a map grid, the prior is a box around the robots as it is at the origin."""
+    far = replace(run, x=run.x + torch.tensor([500_000.0, 5_400_000.0], dtype=torch.float64))
+    near, _ = started(write_log(tmp_path / "near.csv", run, BODIES), tmp_path)
+    (tmp_path / "started.yaml").unlink()
+    model, _ = started(write_log(tmp_path / "far.csv", far, BODIES), tmp_path)
+    for corner in ("lower", "upper"):
+        offset = np.subtract(getattr(model.prior, corner), getattr(near.prior, corner))
+        np.testing.assert_allclose(offset, [500_000.0, 5_400_000.0], atol=2e-3)
+
+
+def test_a_bag_of_drones_is_in_space(tmp_path):
+    """Heights that change say so: the prior has three entries. Observed in the plane, such a bag is refused."""
+    drones = {
+        f"/{name}/odom": [
+            odometry(k * 50 * MS, (side * (2 - 0.05 * k), 0.1, 1 + 0.02 * k), (-side, 0.0, 0.4)) for k in range(40)
+        ]
+        for name, side in (("a", 1.0), ("b", -1.0))
+    }
+    model, _ = started(write_bag(tmp_path / "bag", drones), tmp_path)
+    assert len(model.prior.lower) == 3
+    assert model.prior.lower[2] < 1 < 1.78 < model.prior.upper[2]

@@ -2,16 +2,21 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 
 from tests.logs import write_config, write_log
 from torchfsid.cli import main
 from torchfsid.commands.declared_log import DeclaredLog, automatic_bound
+from torchfsid.commands.figures import doubt_bound
+from torchfsid.commands.functions import observe
 from torchfsid.commands.judged_bound import USELESS, JudgedBound
+from torchfsid.commands.page.content import content
 from torchfsid.config.documents import validate
 from torchfsid.config.observe import ObserveConfig
 from torchfsid.logs.table_log import read_csv
@@ -77,7 +82,30 @@ def test_auto_does_not_end_with_a_bare_ok_on_a_wrong_model(
     assert regions["bound"]["useless"] is found["useless"] is True
     assert regions["bound"]["share"] == found["share"] == found["used"] / found["typical"] > USELESS
     assert main(["check", str(log), "--config", str(tmp_path / "out.yaml")]) == 0
-    assert "is useless: it is" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "is useless: it is" in said
+    assert "consistent: no contradiction" not in said
+    assert "at a useless bound that says nothing of the model" in said
+    page = content(tmp_path / "out")
+    assert page["useless"]
+    assert all("is useless" in robot["meaning"] for robot in page["robots"])
+    assert "ok (bound useless)" in repr(observe(log, config=tmp_path / "out.yaml"))
+
+
+def test_a_figure_says_that_its_bound_is_useless(tmp_path: Path) -> None:
+    judged = JudgedBound(0.5, 1.0, 2.0, "m/s")
+    said = []
+    for bound in ({"used": 0.5, **judged.to_json()}, {"used": 0.1, **replace(judged, bound=0.1).to_json()}):
+        (tmp_path / "regions.json").write_text(json.dumps({"robots": {}, "bound": bound}))
+        figure = Figure()
+        doubt_bound(figure, tmp_path / "regions.json")
+        said.append(figure.get_suptitle())
+    assert said == ["The bound 0.5 m/s is useless: a wrong model explains the log as well", ""]
+
+
+def test_a_bound_read_from_its_results_is_the_same() -> None:
+    judged = JudgedBound(0.5, 1.0, 2.0, "m/s2", differences=0.25)
+    assert JudgedBound.from_json({"used": judged.bound, **judged.to_json()}) == judged
 
 
 def test_a_right_model_is_never_warned_of(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

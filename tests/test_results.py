@@ -22,6 +22,7 @@ from experiments.kinds import KINDS
 from experiments.results import FIGURES, FILES
 from experiments.tables import table
 from torchfsid.commands.results_folder import MANIFEST, ResultsFolder
+from torchfsid.commands.table_file import line_of
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = ROOT / "configs"
@@ -261,3 +262,10 @@ def test_tables_are_wrapped_and_never_cut(width: int):
         console.print(shown)
     texts = ["".join(sorted(c.file.getvalue())).strip().replace("─", "") for c in (console, wide)]  # type: ignore[attr-defined]
     assert texts[0].strip() == texts[1].strip()
+
+
+@pytest.mark.parametrize("name", ["plain", "a,b", 'a"b', "two\nlines", "two\rlines", "two\r\nlines", "", "=1"])
+def test_any_name_comes_back_from_a_table(name: str):
+    lines = [f"{line_of([name, 'end'])}\r\n" for _ in range(2)]
+    assert list(csv.reader(io.StringIO("".join(lines), newline=""))) == 2 * [[name, "end"]]
+    assert list(csv.reader(lines)) == 2 * [[name, "end"]]  # a line in memory, as it is copied into MCAP

@@ -152,7 +152,7 @@ class Check:
                 )
         lines += [] if self.safety is None else [self.safety.conclusion()]
         if self.smallest_bound <= self.declared:
-            lines.append("consistent: no contradiction was seen. That is no proof of the model")
+            lines.append(self._consistent())
         return [*lines, *self.clock.sentence()]
 
     @property
@@ -190,6 +190,17 @@ class Check:
         if self.smallest_bound > self.declared / AUTO_FACTOR:
             line += ", of which more than half is needed: an error of the model may have taken it"
         return line
+
+    def _consistent(self) -> str:
+        """The last word on a log without contradiction. It does not take back what was said before."""
+        if self.bound.is_useless:
+            return "no contradiction was seen; at a useless bound that says nothing of the model"
+        if self.safety is not None and self.safety.verdict != "possible":
+            return (
+                f"no contradiction was seen at {self.declared:.3g} {self.unit}, but gain or {self.safety.what} do not "
+                "fit (above)"
+            )
+        return "consistent: no contradiction was seen. That is no proof of the model"
 
     def to_json(self) -> dict:
         """The content of `check.json`. Infinite values are null."""

@@ -1,7 +1,7 @@
 """The figure of an observed log, from its saved results: regions over trajectories, sizes and cases over time.
 
 A set that is not trusted does not look precise: it is hatched, named by its status instead of its size, and its curve
-is dotted from the first contradiction on.
+is dotted from the first contradiction on. A useless bound is said above all.
 """
 
 from __future__ import annotations
@@ -33,6 +33,9 @@ CASE_WORDS = ("none", "one", "several, parallel", "two", "more")
 
 CASE_WORDS_IN_SPACE = (*CASE_WORDS[:3], "several, independent", "dependent, not parallel")
 """The same in space, where up to three rows are independent."""
+
+DOUBT = "#b00020"
+"""The colour of warnings."""
 
 FLAT = 1.9
 """Width of a scene over its height from which on the map has the whole width of the page."""
@@ -70,6 +73,7 @@ def draw_observation(
                 2, 2, width_ratios=(1.25 if width > 0.6 * height else 0.8, 1), height_ratios=(2, 1)
             )
             places = grid[:, 0], grid[0, 1], grid[1, 1]
+        doubt_bound(figure, out / "regions.json")
         map_axes = figure.add_subplot(places[0])
         unfinished = draw_map(map_axes, final, x[..., :2], seen, bodies, marks)
         sizes = figure.add_subplot(places[1])
@@ -86,6 +90,14 @@ def draw_observation(
         finish_map(map_axes, unfinished, marks)
 
     return render(out / "regions", size, draw)
+
+
+def doubt_bound(figure: Figure, path: Path) -> None:
+    """Say above the figure if the bound in regions.json is useless: no region and no status shows it."""
+    bound = json.loads(path.read_text(encoding="utf-8")).get("bound") or {}
+    if bound.get("useless"):
+        told = f"The bound {bound['used']:.3g} {bound['unit']} is useless: a wrong model explains the log as well"
+        figure.suptitle(told, color=DOUBT, fontweight="bold")
 
 
 def final_regions(path: Path) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from torchfsid.commands.starting_config import starting_config
 from torchfsid.commands.survey import survey
 from torchfsid.commands.terminal import console
 from torchfsid.errors import ConfigError
+from torchfsid.logs.motion import HeightError
 from torchfsid.logs.read import read_log
 from torchfsid.logs.recognise import recognise
 
@@ -25,14 +26,20 @@ def write_config(path: Path, out: Path) -> None:
         raise ConfigError(f"--out: {out} is there, and is not replaced; choose another name")
     found = recognise(path)
     bag, form = found.sections()
-    seen = survey(read_log(path, bag, found.heading or ("heading" if found.has_poses else None), form))
+    heading = found.heading or ("heading" if found.has_poses else None)
+    try:
+        log = read_log(path, bag, heading, form)
+    except HeightError:
+        log = read_log(path, bag, form=form, in_space=True)
+    seen = survey(log)
     content = starting_config(path, out, found, seen)
     with out.open("x", encoding="utf-8") as file:
         file.write(content)
     moving, still = seen.names
-    rest = f", {len(still)} that stand still" if still else ""
+    rest = f", {len(still)} that {'stands' if len(still) == 1 else 'stand'} still" if still else ""
     shown = partial(console().out, highlight=False)
-    shown(f"{path} is {found.what}: {len(moving)} bodies that move{rest}, {len(seen.log.t)} times.")
+    bodies = "1 body that moves" if len(moving) == 1 else f"{len(moving)} bodies that move"
+    shown(f"{path} is {found.what}: {bodies}{rest}, {len(seen.log.t)} times.")
     shown(f"{out} is written. Edit the lines marked EDIT, then:")
     shown(f"  torchfsid check {path} --config {out}")
     shown(f"  torchfsid observe {path} --config {out} --out results")

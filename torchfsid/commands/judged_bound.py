@@ -13,7 +13,9 @@ status can say so, since the set is not empty.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -73,6 +75,14 @@ class JudgedBound:
             return "no motion was seen"
         return f"{self._percent} of the typical control seen, {self.typical:.3g} {self.unit}"
 
+    def doubt(self) -> str:
+        """What a useless bound means, as a sentence."""
+        total = self.bound + self.differences
+        return (
+            f"the bound {total:.3g} {self.unit} is useless: it is {self.compared()} (the largest: "
+            f"{self.largest:.3g}), so that a wrong model explains the log as well as the right one"
+        )
+
     def warning(self, is_needed: bool, is_explained: bool = False) -> str:
         """What is to be said of a useless bound.
 
@@ -86,17 +96,20 @@ class JudgedBound:
         if self.differences > self.bound:
             advice = "most of it comes from differences of velocities: log accelerations, or more exact velocities"
         end = "" if is_explained else f"; {advice}"
-        total = self.bound + self.differences
-        return (
-            f"the bound {total:.3g} {self.unit} is useless: it is {self.compared()} (the largest: "
-            f"{self.largest:.3g}), so that a wrong model explains the log as well as the right one{end}"
-        )
+        return self.doubt() + end
 
     def cell(self, status: str, is_found: bool) -> str:
         """A status for a table. `ok` is never said alone if the bound is useless or was found in the same log."""
         if status != "ok" or not (self.is_useless or is_found):
             return status
         return "ok (bound useless)" if self.is_useless else f"ok (bound {self._percent})"
+
+    @classmethod
+    def from_json(cls, entry: Mapping[str, Any]) -> JudgedBound:
+        """The bound of `to_json`, with the bound itself as `used`, as in regions.json."""
+        typical, used = entry["typical"], entry["used"]
+        further = entry["share"] * typical - used if typical else 0.0
+        return cls(used, typical, entry["largest"], entry["unit"], max(0.0, further))
 
     def to_json(self) -> dict:
         """The entry of results files. NaN stands for no motion."""

@@ -180,6 +180,10 @@ class Observed:
         return results.path
 
     def __repr__(self) -> str:
-        robots = [f"{of.robot}: {of.status}, diameter {of.diameter:.3g}" for of in self.verdicts[:MOST_SHOWN]]
+        is_found = self.observation.smallest_bounds is not None
+        robots = [
+            f"{of.robot}: {self.observation.bound.cell(of.status, is_found)}, diameter {of.diameter:.3g}"
+            for of in self.verdicts[:MOST_SHOWN]
+        ]
         more = f", and {len(self.verdicts) - MOST_SHOWN} more" if len(self.verdicts) > MOST_SHOWN else ""
         return f"Observed({self.observation.samples} samples; {'; '.join(robots)}{more})"

@@ -19,6 +19,7 @@ from torchfsid.commands.clock import Clock
 from torchfsid.commands.figure_style import render
 from torchfsid.commands.figures import (
     CASE_WORDS_IN_SPACE,
+    doubt_bound,
     draw_cases,
     draw_observation,
     draw_sizes,
@@ -67,6 +68,7 @@ def draw_in_space(
     marks, clock = marks or Marks(), Clock.of(float(next(iter(history.values()))["t"][0]))
 
     def draw(figure: Figure) -> None:
+        doubt_bound(figure, out / "regions.json")
         grid = figure.add_gridspec(3, 2, height_ratios=(1, 1, 0.32))
         maps = []
         for plane, place in zip(PLANES, (grid[1, 0], grid[0, 0], grid[0, 1]), strict=True):

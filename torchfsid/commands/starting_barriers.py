@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from torchfsid.commands.survey import Survey
-from torchfsid.commands.yaml_lines import line, numbers, rounded_down, rounded_up, short
+from torchfsid.commands.yaml_lines import coordinates, line, numbers, rounded_down, rounded_up, short
 
 KEPT = 0.95
 """Share of the smallest distance seen that is taken for the safety distance: nearer to it, gains would be infinite."""
@@ -97,7 +97,8 @@ def _limits(seen: Survey) -> list[str]:
         return lines
     speed, (low, high) = short(rounded_up(seen.fastest or 1.0)), seen.extent
     room = _safety_distance(seen)
-    walls = f"lower: {numbers(low - room)}, upper: {numbers(high + room)}"
+    lower, upper = (", ".join(coordinates(corner, room)) for corner in (low - room, high + room))
+    walls = f"lower: [{lower}], upper: [{upper}]"
     return [
         *lines,
         line(f"  # - {{kind: speed_disc, limit: {speed}}}", "by norm; or speed_polygon, sides: 8"),

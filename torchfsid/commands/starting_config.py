@@ -12,11 +12,14 @@ from pathlib import Path
 from torchfsid import __version__
 from torchfsid.commands.starting_barriers import barrier_lines
 from torchfsid.commands.survey import Survey
-from torchfsid.commands.yaml_lines import line, numbers, rounded_up, section, short, word
+from torchfsid.commands.yaml_lines import coordinates, line, rounded_up, section, short, word
 from torchfsid.logs.recognise import Recognised
 
 AROUND = 0.5
 """Share of the larger side of the box in which bodies moved that is added on each side of the prior."""
+
+LEAST = 1e-3
+"""Size of the box from which the prior is made [m], where bodies stay in one place."""
 
 OWN_ERROR = 0.01
 """Share of the typical speed that controllers are wrong by, to start from, where positions are measured."""
@@ -42,7 +45,9 @@ def _head(path: Path, out: Path, found: Recognised, seen: Survey) -> list[str]:
     log, names = seen.log, ", ".join(seen.log.bodies[:12]) + (", .." if len(seen.log.bodies) > 12 else "")
     low, high = seen.extent
     axes = "xyz"[: len(low)]
-    box = ", ".join(f"{axis} {a:.4g} .. {b:.4g}" for axis, a, b in zip(axes, low, high, strict=True))
+    size = max(float((high - low).max()), LEAST)
+    ends = zip(axes, coordinates(low, size), coordinates(high, size), strict=True)
+    box = ", ".join(f"{axis} {a} .. {b}" for axis, a, b in ends)
     unit = "m/s2" if log.a is not None else "m/s"
     lines = [
         f"# Written by torchfsid init {__version__} for {path.name}: {found.what}",
@@ -57,7 +62,7 @@ def _head(path: Path, out: Path, found: Recognised, seen: Survey) -> list[str]:
             "#   Are these metres? Positions of other units need a section log: {format: columns, unit: mm, ..}"
         )
     return [
-        *lines,
+        *map(_in_one_line, lines),
         "#",
         "# Edit the lines marked EDIT: no log tells what robots want, or how they avoid each other. Then ask whether",
         "# the log fits this model, and for the sets:",
@@ -69,6 +74,11 @@ def _head(path: Path, out: Path, found: Recognised, seen: Survey) -> list[str]:
         "# and make this the first line:",
         "#   # yaml-language-server: $schema=torchfsid.schema.json",
     ]
+
+
+def _in_one_line(text: str) -> str:
+    """The text without line breaks, which would end a comment: names of bodies may have some."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 def _task(seen: Survey) -> list[str]:
@@ -100,11 +110,12 @@ def _task(seen: Survey) -> list[str]:
 
 def _prior(seen: Survey) -> list[str]:
     low, high = seen.extent
-    around = AROUND * max(float((high - low).max()), 1e-3)
+    size = max(float((high - low).max()), LEAST)
+    lower, upper = (", ".join(coordinates(corner, size)) for corner in (low - AROUND * size, high + AROUND * size))
     return [
         line("prior:", "a box that surely holds every theta; too small a one loses goals"),
-        line(f"  lower: {numbers(low - around)}", "EDIT: [m] where bodies were, and half of that around"),
-        f"  upper: {numbers(high + around)}",
+        line(f"  lower: [{lower}]", "EDIT: [m] where bodies were, and half of that around"),
+        f"  upper: [{upper}]",
     ]
 
 

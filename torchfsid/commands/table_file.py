@@ -82,8 +82,8 @@ def number(value: float) -> str:
 def line_of(cells: Sequence[str]) -> str:
     """The cells as a part of a line."""
     text = io.StringIO(newline="")
-    csv.writer(text, lineterminator="").writerow(cells)
-    return text.getvalue()
+    csv.writer(text, lineterminator="\r\n").writerow(cells)  # characters of the terminator are what is quoted in cells
+    return text.getvalue().removesuffix("\r\n")
 
 
 def lines_of(values: Tensor) -> list[str]:

@@ -53,6 +53,12 @@ def numbers(values: Iterable[float]) -> str:
     return f"[{', '.join(short(float(value)) for value in values)}]"
 
 
+def coordinates(values: Iterable[float], size: float) -> list[str]:
+    """Coordinates to a thousandth of the size of what they are about, however far they are from the origin."""
+    digits = 3 - math.floor(math.log10(size))
+    return [f"{round(float(value), digits):.15g}" for value in values]
+
+
 def short(value: float) -> str:
     """A number of at most four digits, as YAML 1.1 reads it."""
     text = f"{value:.4g}"

@@ -26,6 +26,10 @@ LONG_AGO = 1_000_000_000_000_000
 they are counted from the first."""
 
 
+class HeightError(LogError):
+    """A body in the plane changes its height: it may be in space."""
+
+
 class Motion(NamedTuple):
     """Samples of one body.
 
@@ -72,12 +76,12 @@ class Motion(NamedTuple):
         """Check that the height stays the same.
 
         Raises:
-            LogError: it does not, or is no number.
+            HeightError: it does not, or is no number.
         """
         low, high = float(self.x[:, 2].min()), float(self.x[:, 2].max())
         if not high - low <= LEVEL:
             told = "robots in the plane (a prior of two entries)"
-            raise LogError(f"{where}: {told}, but the height changes from {low:g} to {high:g} m")
+            raise HeightError(f"{where}: {told}, but the height changes from {low:g} to {high:g} m")
 
 
 def rotation_of(x: float, y: float, z: float, w: float) -> Float[np.ndarray, "3 3"] | None:

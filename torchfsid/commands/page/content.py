@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from torchfsid.commands.judged_bound import JudgedBound
 from torchfsid.commands.page import words
 from torchfsid.commands.page.motion import read_motion
 from torchfsid.commands.page.sets import Facets, drawn, fewer, read_sets
@@ -100,6 +101,7 @@ def _content(
     if len(parameters) != history.dim:
         parameters, units = [f"θ{i}" for i in range(history.dim)], [""] * history.dim
     sets, around = _sets(folder, final, history, notes), history.around()
+    bound = JudgedBound.from_json(final["bound"]) if "share" in (final.get("bound") or {}) else None
     robots = []
     for i, robot in enumerate(history.robots):
         region = final["robots"][robot]
@@ -107,7 +109,7 @@ def _content(
             {
                 "name": robot,
                 "status": region["status"],
-                "meaning": words.MEANING[region["status"]],
+                "meaning": words.meaning(region["status"], bound),
                 "evidence": words.evidence(region, shift),
                 "skipped": region.get("skipped"),
                 "last_cut": shift(region.get("last_cut")),
@@ -137,7 +139,8 @@ def _content(
         "motion": motion,
         "prior": [prior["lower"], prior["upper"]] if "lower" in prior and "upper" in prior else None,
         "keep_out": _keep_out(config),
-        "model": [*words.model(config), *_bound(final)],
+        "model": [*words.model(config), *words.of_bound(bound)],
+        "useless": bound is not None and bound.is_useless,
         "safety": _safety(final),
         "refutations": [words.of_refutation(found, clock) for found in final.get("refutations", [])],
         "odd": final.get("odd", []),
@@ -247,11 +250,6 @@ def _keep_out(config: Mapping[str, Any]) -> float | None:
         if isinstance(distance, int | float):
             return float(distance)
     return None
-
-
-def _bound(final: Mapping[str, Any]) -> list[list[str]]:
-    bound = final.get("bound") or {}
-    return [["bound on controls", f"{bound['used']:.4g} {bound.get('unit', '')}".strip()]] if "used" in bound else []
 
 
 def _safety(final: Mapping[str, Any]) -> list[dict[str, Any]]:

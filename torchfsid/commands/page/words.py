@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from torchfsid.commands.judged_bound import JudgedBound
+
 MEANING = {
     "ok": "No contradiction was seen. That is no proof of the model.",
     "alarm": (
@@ -20,6 +22,19 @@ MEANING = {
 
 Shift = Callable[[float | None], float | None]
 """From a time of the files to one of the page [s]."""
+
+
+def meaning(status: str, bound: JudgedBound | None) -> str:
+    """What a status means. `ok` is never said without a useless bound beside it."""
+    if status != "ok" or bound is None or not bound.is_useless:
+        return MEANING[status]
+    doubt = bound.doubt()
+    return f"{MEANING[status]} {doubt[0].upper()}{doubt[1:]}."
+
+
+def of_bound(bound: JudgedBound | None) -> list[list[str]]:
+    """The bound on the errors of controls, a line of the model: its name and value."""
+    return [] if bound is None else [["bound on controls", f"{bound.bound:.4g} {bound.unit}, {bound.compared()}"]]
 
 
 def evidence(region: Mapping[str, Any], shift: Shift) -> list[dict[str, Any]]:

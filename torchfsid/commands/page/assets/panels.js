@@ -2,9 +2,13 @@
 
 const WORDS = { ok: "no contradiction", alarm: "alarm", inconsistent: "inconsistent" };
 
+/** A verdict in words. "No contradiction" is never said alone if the bound is useless. */
+const verdictOf = (status) => WORDS[status] + (status === TRUSTED && data.useless ? " (bound useless)" : "");
+const toneOf = (status) => (status === TRUSTED && !data.useless ? "good" : "bad");
+
 function heading() {
   const counts = Object.keys(WORDS)
-    .map((status) => [robots.filter((robot) => robot.status === status).length, WORDS[status]])
+    .map((status) => [robots.filter((robot) => robot.status === status).length, verdictOf(status)])
     .filter(([count]) => count);
   byId("title").textContent = data.heading ?? data.title;
   byId("lead").textContent =
@@ -33,7 +37,7 @@ const swatch = (i) => {
 const cells = robots.map((robot, i) => {
   const box = element("input", { type: "checkbox", checked: true, "aria-label": `show ${robot.name}`, onchange: () => show(i, box.checked) });
   const cell = { box, size: element("td", { className: "number" }), point: element("td", { className: "wide point" }), rows: element("td", { className: "wide" }) };
-  const verdict = element("td", { className: robot.status === TRUSTED ? "good" : "bad" }, WORDS[robot.status]);
+  const verdict = element("td", { className: toneOf(robot.status) }, verdictOf(robot.status));
   cell.line = element("tr", { onclick: (event) => { if (event.target !== box) choose(i); } },
     element("td", {}, box), element("td", {}, swatch(i), element("button", { title: "Show its set and verdict below" }, robot.name)),
     verdict, cell.size, cell.point, cell.rows);
@@ -68,7 +72,7 @@ function verdict() {
   if (said !== i) {
     said = i;
     byId("lens-title").textContent = `${robot.name}: its set, enlarged`;
-    byId("verdict-title").replaceChildren(swatch(i), `${robot.name}: `, element("span", { className: robot.status === TRUSTED ? "good" : "bad" }, WORDS[robot.status]));
+    byId("verdict-title").replaceChildren(swatch(i), `${robot.name}: `, element("span", { className: toneOf(robot.status) }, verdictOf(robot.status)));
     byId("verdict").textContent = robot.meaning + (robot.status === TRUSTED ? "" : " torchfsid check says which rows and bounds do not fit.");
     byId("evidence").replaceChildren(...robot.evidence.map((event) =>
       element("li", { className: event.reset ? "mild" : "" }, "At ", moveTo(event.t), `: ${event.what}`,
