@@ -41,7 +41,7 @@ def box_of(vertices, k, n):
 
 @item_of_ordered
 @no_type_check
-def _beyond(vertices, k, n, p, q, c):
+def most_beyond(vertices, k, n, p, q, c):
     """The largest distance by which a vertex exceeds the line (p, q).z = c."""
     most = -np.inf
     for i in range(n):
@@ -60,7 +60,7 @@ def exceeded(vertices, k, n, reach, box, p, q, c):
     x0, x1, y0, y1 = box
     if p * (x1 if p > 0 else x0) + q * (y1 if q > 0 else y0) - c > 0:
         tolerance = ROUND_OFF * (abs(p) * reach[k, 0] + abs(q) * reach[k, 1] + abs(c))
-        beyond = _beyond(vertices, k, n, p, q, c)
+        beyond = most_beyond(vertices, k, n, p, q, c)
         if beyond > tolerance:
             return beyond, tolerance
     return 0.0, 0.0
@@ -273,22 +273,6 @@ def clip(polygons, A, b, stamp, source, first_label, most):
                     new += 1
         _pad(result, k, n)
     return result, outcome, shrunk, entered[:new], (lost_A, lost_b, lost_time, lost_source)
-
-
-@launcher
-@no_type_check
-def moved_around(vertices, count, reach, A, b):
-    """The bounds (B, R) of the rows A (B, R, 2), b, moved outward until row r of item k holds polygon k, rounded up."""
-    moved = b.copy()
-    for k in range(len(b)):
-        n = count[k]
-        x0, x1, y0, y1 = box_of(vertices, k, n)
-        for r in range(b.shape[1]):
-            p, q, c = A[k, r, 0], A[k, r, 1], b[k, r]
-            round_off = ROUND_OFF * (abs(p) * reach[k, 0] + abs(q) * reach[k, 1] + abs(c))
-            if p * (x1 if p > 0 else x0) + q * (y1 if q > 0 else y0) + round_off > c:
-                moved[k, r] = max(c, c + _beyond(vertices, k, n, p, q, c) + round_off)
-    return moved
 
 
 @launcher
