@@ -209,7 +209,7 @@ def _cross(points, k, ring, over, inner, outer):
 def cut_one(k, polygons, A, b, most, scratch):
     """Cut polygon k by its rows. The vertices of the new ring, its edges and their lines are in `scratch`.
 
-    Returns (n, outcome, whether it is smaller, and three lines that contradict each other if it is EMPTY).
+    Returns what `cut_ring` returns.
     """
     vertices, ring_A, ring_b, _, _, _, count, reach = polygons
     ring, edge, lines, tolerance, depth, cutting, over, spare, spare_edge = scratch
@@ -240,8 +240,7 @@ def keep_ring(k, n, polygons, stamp, source, scratch, marks, result):
 
     With `marks`, the label of an edge from row r is -1 - (k R + r) until it gets its own. Otherwise it is 0.
     """
-    _, _, _, time, ring_source, label, _, _ = polygons
-    ring, edge, lines = scratch[0], scratch[1], scratch[2]
+    (time, ring_source, label), (ring, edge, lines) = polygons[3:6], scratch[:3]
     to_vertices, to_A, to_b, to_time, to_source, to_label, to_count, _ = result
     V, R = time.shape[1], stamp.shape[1]
     to_count[k] = n
@@ -261,7 +260,7 @@ def keep_ring(k, n, polygons, stamp, source, scratch, marks, result):
 @no_type_check
 def keep_contradiction(k, found, polygons, stamp, source, lines, lost):
     """Write the three lines `found` that contradict each other to item k of `lost`: A, b, time and source."""
-    _, _, _, time, ring_source, _, _, _ = polygons
+    time, ring_source = polygons[3], polygons[4]
     lost_A, lost_b, lost_time, lost_source = lost
     V = time.shape[1]
     for i, e in enumerate(found):
@@ -283,9 +282,8 @@ def clip(polygons, A, b, stamp, source, first_label, most):
     """
     (B, R), V = b.shape, polygons[2].shape[1]
     W = V + R + 1
-    lines = np.empty((W, 3))
     scratch = (
-        np.empty((W, 2)), np.empty(W, np.int64), lines,
+        np.empty((W, 2)), np.empty(W, np.int64), np.empty((W, 3)),
         np.empty(R), np.empty(R), np.empty(R, np.int64), np.empty(W), np.empty((W, 2)), np.empty(W, np.int64),
     )  # fmt: skip
     result, slots, new = polygons, 0, 0
@@ -295,7 +293,7 @@ def clip(polygons, A, b, stamp, source, first_label, most):
     for k in range(B):
         n, outcome[k], shrunk[k], row, before, after = cut_one(k, polygons, A, b, most, scratch)
         if outcome[k] == EMPTY:
-            keep_contradiction(k, (row, before, after), polygons, stamp, source, lines, lost)
+            keep_contradiction(k, (row, before, after), polygons, stamp, source, scratch[2], lost)
         if not shrunk[k]:
             if slots > 0:
                 copy_polygon(polygons, k, result)
