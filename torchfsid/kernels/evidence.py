@@ -255,9 +255,9 @@ def inverse_optimal(k, m, u, ball, C, d, normals, generator, count, none, row_A,
 @item
 @no_type_check
 def read_one(k, rows, sample, angles, fan, around, relaxes, paper, active_tolerance, scratch, judged, kkt):
-    """Fill the places of robot k in `judged` and `kkt`, which are results of `evidence`, and its outward normals.
+    """Fill the places of robot k in `judged` and `kkt`, results of `evidence`, and its normals. Returns their number.
 
-    Returns the number of the normals. It is -1 if the robot is not informative.
+    It is -1 if the robot is not informative.
     """
     A, b, hard, relaxed = rows
     C, d, u, usable, bound = sample
@@ -283,6 +283,13 @@ def read_one(k, rows, sample, angles, fan, around, relaxes, paper, active_tolera
         informative[k] = pointed and not strained
         infeasible[k] = not alarmed[k] and not informative[k]
     return count if informative[k] else -1
+
+
+@item
+@no_type_check
+def rows_for(m, paper, clips):
+    """The number of half-spaces, padding included, that follow from m rows."""
+    return ROWS if clips else m + CRITICAL_NORMALS + 1 if paper else NORMALS + 1
 
 
 @launcher
@@ -312,12 +319,10 @@ def evidence(A, b, hard, relaxed, C, d, u, usable, bound, angles, ball, drift, c
         Half-spaces (A, b, source), padded. Then (informative, alarmed, infeasible, slack, excess), as in `Evidence`.
         Then (G, f, projector, free, offset, active, n_active, rank, case), as in `KktSolution`.
     """
-    B, m = b.shape
-    fan = angles[:, :0] if paper else angles
+    (B, m), fan = b.shape, angles[:, :0] if paper else angles
     generators = m * len(SPREAD) if fan.shape[1] > 0 else m
-    around = CRITICAL_DIRECTIONS if paper else DIRECTIONS
-    work = workspace(clip[3].shape[1])
-    R = ROWS if len(clip[0]) > 0 else (m if paper else 0) + len(around) + 1
+    around, work = CRITICAL_DIRECTIONS if paper else DIRECTIONS, workspace(clip[3].shape[1])
+    R = rows_for(m, paper, len(clip[0]) > 0)
     half_spaces = np.zeros((B, R, C.shape[2])), np.ones((B, R)), np.full((B, R), -1)
     judged = np.empty(B, np.bool_), np.empty(B, np.bool_), np.zeros(B, np.bool_), np.empty((B, m)), np.empty((B, m))
     kkt = (
@@ -328,7 +333,7 @@ def evidence(A, b, hard, relaxed, C, d, u, usable, bound, angles, ball, drift, c
         np.zeros((m, 2)), np.empty(m), np.empty(m, np.bool_), np.empty(generators), np.empty(generators, np.int64),
         np.empty((len(around) + 1, 2)), np.empty(len(around) + 1, np.int64),
     )  # fmt: skip
-    unit, unit_b, normals, generator = scratch[0], scratch[1], scratch[5], scratch[6]
+    (unit, unit_b), (normals, generator) = scratch[:2], scratch[5:]
     rows, sample, relaxes = (A, b, hard, relaxed), (C, d, u, usable, bound), relaxed.any()
     for k in range(B):
         count = read_one(k, rows, sample, angles, fan, around, relaxes, paper, active_tolerance, scratch, judged, kkt)
@@ -336,8 +341,7 @@ def evidence(A, b, hard, relaxed, C, d, u, usable, bound, angles, ball, drift, c
             continue
         of = normals, generator, count
         if paper:
-            G, f, P, offset, active = kkt[0], kkt[1], kkt[2], kkt[4], kkt[5]
-            critical_region(k, unit, unit_b, C, d, G, f, P, offset, active, *of, *half_spaces)
+            critical_region(k, unit, unit_b, C, d, *kkt[:3], *kkt[4:6], *of, *half_spaces)
         else:
             room, shift = ball[min(k, len(ball) - 1)], drift[min(k, len(drift) - 1)]
             if len(clip[0]) > 0:

@@ -207,10 +207,7 @@ def _cross(points, k, ring, over, inner, outer):
 @item
 @no_type_check
 def cut_one(k, polygons, A, b, most, scratch):
-    """Cut polygon k by its rows. The vertices of the new ring, its edges and their lines are in `scratch`.
-
-    Returns what `cut_ring` returns.
-    """
+    """Cut polygon k by its rows, as `cut_ring` does. The new ring, its edges and their lines are in `scratch`."""
     vertices, ring_A, ring_b, _, _, _, count, reach = polygons
     ring, edge, lines, tolerance, depth, cutting, over, spare, spare_edge = scratch
     n, V = count[k], ring_b.shape[1]
