@@ -48,21 +48,23 @@ def can_be_compiled(model: ObservationModel, sample: Sample, wanted: bool | None
     elif torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
         obstacle = "gradients are required"
     elif not all(tensor.is_cpu for tensor in tensors):
-        obstacle = _obstacle_on_device(tensors, in_space)
+        obstacle = _obstacle_on_device(tensors, sample.rows)
     if wanted and obstacle is not None:
         raise InputError("compiled", "False or None", f"True, but {obstacle}")
     return obstacle is None
 
 
-def _obstacle_on_device(tensors: Sequence[Tensor], in_space: bool) -> str | None:
+def _obstacle_on_device(tensors: Sequence[Tensor], rows: Halfspaces) -> str | None:
     if not all(tensor.is_cuda for tensor in tensors):
         return "tensors are neither all on the CPU nor all on CUDA"
-    return "tensors are on CUDA, and controls in space" if in_space else device.missing() or None
+    if rows.dim == 3 or rows.rows == 0:
+        return f"tensors are on CUDA, and {'controls in space' if rows.dim == 3 else 'there are no rows'}"
+    return device.missing() or None
 
 
 def read(model: ObservationModel, sample: Sample) -> Read:
     """What the kernels say of a sample."""
-    if sample.rows.dim == 2 and device.has_kernels(sample.rows.A, sample.u):
+    if sample.rows.dim == 2 and sample.rows.rows > 0 and device.has_kernels(sample.rows.A, sample.u):
         return _read_on_device(model, sample)
     angles = sample.u[:, :0] if sample.row_errors is None else sample.row_errors.angle
     rows, relaxed = (sample.rows.A, sample.rows.b, sample.hard), (sample.relaxed,)

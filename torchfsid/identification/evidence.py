@@ -195,8 +195,9 @@ def evidence(
             not known exactly, and for position errors of tasks with an unknown gain.
         measurement: a measurement of these robots, or several concatenated.
         compiled: whether to run compiled code instead of torch. None chooses compiled code wherever it is possible:
-            controls are in the plane or in space, no gradient is needed, and tensors are on the CPU. A nominal control
-            is clipped only if theta is planar, and rows are relaxed only in the plane.
+            controls are in the plane or in space, no gradient is needed, and tensors are on the CPU. Tensors may be on
+            CUDA if controls are in the plane and the extra `cuda` is installed. A nominal control is clipped only if
+            theta is planar, and rows are relaxed only in the plane.
 
     Raises:
         InputError: the measurement has no velocities, they are not finite for an observed robot, the measurement does

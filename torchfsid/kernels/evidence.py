@@ -333,15 +333,14 @@ def evidence(A, b, hard, relaxed, C, d, u, usable, bound, angles, ball, drift, c
         np.zeros((m, 2)), np.empty(m), np.empty(m, np.bool_), np.empty(generators), np.empty(generators, np.int64),
         np.empty((len(around) + 1, 2)), np.empty(len(around) + 1, np.int64),
     )  # fmt: skip
-    (unit, unit_b), (normals, generator) = scratch[:2], scratch[5:]
     rows, sample, relaxes = (A, b, hard, relaxed), (C, d, u, usable, bound), relaxed.any()
     for k in range(B):
         count = read_one(k, rows, sample, angles, fan, around, relaxes, paper, active_tolerance, scratch, judged, kkt)
         if count < 0:
             continue
-        of = normals, generator, count
+        of = *scratch[5:], count
         if paper:
-            critical_region(k, unit, unit_b, C, d, *kkt[:3], *kkt[4:6], *of, *half_spaces)
+            critical_region(k, *scratch[:2], C, d, *kkt[:3], *kkt[4:6], *of, *half_spaces)
         else:
             room, shift = ball[min(k, len(ball) - 1)], drift[min(k, len(drift) - 1)]
             if len(clip[0]) > 0:

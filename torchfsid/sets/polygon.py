@@ -140,7 +140,7 @@ class Polygon:
         """See `Body.clip`. An edge with parallel neighbours, as in a parallelogram, is never merged."""
         differentiable = torch.is_grad_enabled() and (A.requires_grad or b.requires_grad)
         first = 1 + self.sheets.rows if differentiable else 0
-        if device.has_kernels(A, b, self.b):
+        if b.shape[1] > 0 and device.has_kernels(A, b, self.b):
             return self._clipped_on_device(A, b, time, source, most, first)
         parts, outcome, shrunk, entered, against = kernel.clip(
             tuple(map(array, self.fields())), array(A), array(b), array(time), array(source), first, most
