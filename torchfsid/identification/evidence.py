@@ -210,8 +210,10 @@ def read_sample(model: ObservationModel, sample: Sample, compiled: bool | None) 
     """`evidence` of a sample that is already evaluated."""
     if not compiled_evidence.can_be_compiled(model, sample, compiled):
         return _in_torch(model, sample)
-    omega, judged, solved = compiled_evidence.read(model, sample)
-    return Evidence(omega, *judged, sample.hard, lambda: solved, sample.omega_without(model))
+    omega, (informative, alarmed, infeasible, slack, excess), solved = compiled_evidence.read(model, sample)
+    return Evidence(
+        omega, informative, alarmed, infeasible, slack, excess, sample.hard, lambda: solved, sample.omega_without(model)
+    )
 
 
 def sample_of(model: ObservationModel, theta: FeasibleSet, measurement: Measurement) -> Sample:

@@ -9,7 +9,9 @@ A kernel is compiled for each number of rows. An item's scratch lies in its thre
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
+import warnings
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any, no_type_check
@@ -92,7 +94,10 @@ def _launch(
         return
     arrays = [tuple(map(_array, part)) for part in (*given, *results)]
     queue = cuda.external_stream(stream) if stream else 0
-    kernel[(count + THREADS - 1) // THREADS, THREADS, queue](*arrays, values)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Grid size")  # few items leave most of a device idle: so be it
+        launcher = kernel[(count + THREADS - 1) // THREADS, THREADS, queue]
+    launcher(*arrays, values)
 
 
 def _array(array: Any) -> Any:
