@@ -29,6 +29,8 @@ from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.tasks import GoalTask, Saturation
 from torchfsid.sets.feasible_set import FeasibleSet
 
+pytestmark = pytest.mark.filterwarnings("ignore:divide by zero")  # in Python, a row 0.z <= -1 is noticed
+
 SIZES = [1, 7, 65]
 """Batches of one item, of a part of a block of threads, and of one item more than a block."""
 

@@ -56,7 +56,7 @@ def clip(given: Sequence[Arrays], values: tuple[int, bool], results: Sequence[Ar
         stream: the address of the stream to run on.
     """
     (B, R), slots = given[1][1].shape, max(given[0][2].shape[1], values[0])
-    _launch(_clip(R, slots + R + 1), B, given, values, results, stream)
+    _launch(_clip(R, slots + R + 1), B, given, (values[0], int(values[1])), results, stream)
 
 
 def evidence(
@@ -80,7 +80,8 @@ def evidence(
     kernel = _evidence(m, paper, len(angles) > 0, corners[0].shape[1] if corners else 0)
     # Arrays in the place of those that are missing are not read.
     given = rows, sample, bounds, (angles[0] if angles else sample[2], corners[0] if corners else sample[0])
-    _launch(kernel, B, given, (float(tolerance), *(clip or (1.0, 1.0, False, 0.0))), results, stream)
+    first, second, by_norm, dead_speed = clip or (1.0, 1.0, False, 0.0)
+    _launch(kernel, B, given, (tolerance, first, second, dead_speed, int(by_norm)), results, stream)
 
 
 def _around(paper: bool) -> np.ndarray:
@@ -129,7 +130,7 @@ def _clip(R: int, W: int) -> Callable:
         if state == EMPTY:
             keep_contradiction(k, (row, before, after), polygons, stamp, source, lines, lost)
         if shrunk[k]:
-            keep_ring(k, n, polygons, stamp, source, scratch, values[1], result)
+            keep_ring(k, n, polygons, stamp, source, scratch, values[1] != 0, result)
         else:
             copy_polygon(polygons, k, result)
 
@@ -205,7 +206,7 @@ def _evidence(m: int, paper: bool, uncertain: bool, slots: int) -> Callable:
                 cuda.local.array((most, 2), float64),
                 found,
             )
-            clip = (values[1], values[2]), values[3], values[4], errors[1]
+            clip = (values[1], values[2]), values[4] != 0, values[3], errors[1]
             clipped_inverse_optimal(
                 k, m, u, room, shift, C, d, clip, normals, generator, count, len(order), work, row_A, row_b, row_source
             )
