@@ -1,6 +1,7 @@
 """python -m benchmarks NAME [options]
 
-NAME: geometry, polyhedra, layers, fleet, observer, gradients, safety, orca, threads or observe.
+NAME: geometry, polyhedra, layers, fleet, observer, gradients, safety, orca, threads, observe or
+cuda.
 """
 
 from __future__ import annotations
@@ -9,7 +10,19 @@ import os
 import sys
 from importlib import import_module
 
-NAMES = ("geometry", "polyhedra", "layers", "fleet", "observer", "gradients", "safety", "orca", "threads", "observe")
+NAMES = (
+    "geometry",
+    "polyhedra",
+    "layers",
+    "fleet",
+    "observer",
+    "gradients",
+    "safety",
+    "orca",
+    "threads",
+    "observe",
+    "cuda",
+)
 
 
 def main(arguments: list[str]) -> int:

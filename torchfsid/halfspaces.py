@@ -112,7 +112,7 @@ class Halfspaces:
 
     def shortened(self) -> Halfspaces:
         """The same set, with rows scaled if a product of one with a point could overflow."""
-        if self.b.numel() == 0 or np.abs(array(self.A)).max(initial=0.0) < LONG:
+        if self.b.numel() == 0 or self.dim == 0 or _largest(self.A) < LONG:
             return self
         A, b, _ = self._scaled()
         return Halfspaces(A, b, self.source)
@@ -194,7 +194,14 @@ def reals(name: str, value: object) -> Tensor:
 
 def finite(*tensors: Tensor) -> bool:
     """Are all numbers finite? The sum is tested first, because it is finite unless a number is not or it overflows."""
-    return all(math.isfinite(float(t.detach().sum())) or bool(t.isfinite().all()) for t in tensors)
+    return math.isfinite(float(sum(t.detach().sum() for t in tensors))) or all(
+        bool(t.isfinite().all()) for t in tensors
+    )
+
+
+def _largest(tensor: Tensor) -> float:
+    """The largest |entry| of a tensor that is not empty. Numpy is the fastest on the CPU."""
+    return float(np.abs(array(tensor)).max() if tensor.is_cpu else tensor.detach().abs().amax())
 
 
 def array(tensor: Tensor) -> np.ndarray:

@@ -27,19 +27,17 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Literal, get_args
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchfsid.errors import InputError
-from torchfsid.halfspaces import Halfspaces, array, dot, finite
+from torchfsid.halfspaces import Halfspaces, dot, finite
+from torchfsid.identification import compiled_evidence
 from torchfsid.identification.active_set import touched
 from torchfsid.identification.critical_region import region_of
 from torchfsid.identification.inverse_optimal import normals_of, per_row, set_around, without_direction
 from torchfsid.identification.kkt import KktSolution, solve_unit
-from torchfsid.kernels import evidence as kernel
-from torchfsid.kernels.evidence_in_space import evidence_in_space
 from torchfsid.robots.arguments import require_barriers, require_choice, require_task
 from torchfsid.robots.barriers import Barrier, controller_failed, possible_rows, row_errors
 from torchfsid.robots.bounds import ErrorBounds, NoiseBound, RowErrors
@@ -48,9 +46,6 @@ from torchfsid.robots.neighbours import left_out_inactive, within_bounds
 from torchfsid.robots.tasks import Task, feedback_of
 from torchfsid.sets.feasible_set import FeasibleSet
 from torchfsid.tolerances import ACTIVE_TOLERANCE, RELAXED_OPENING, ROUND_OFF
-
-NO_CLIP = (np.empty(0), False, 0.0, np.empty((0, 0, 2)))
-"""`clip` of `kernels.evidence` for nominal controls that are not clipped."""
 
 SetKind = Literal["critical_region", "inverse_optimal"]
 
@@ -200,8 +195,9 @@ def evidence(
             not known exactly, and for position errors of tasks with an unknown gain.
         measurement: a measurement of these robots, or several concatenated.
         compiled: whether to run compiled code instead of torch. None chooses compiled code wherever it is possible:
-            controls are in the plane or in space, no gradient is needed, and tensors are on the CPU. A nominal control
-            is clipped only if theta is planar, and rows are relaxed only in the plane.
+            controls are in the plane or in space, no gradient is needed, and tensors are on the CPU. Tensors may be on
+            CUDA if controls are in the plane and the extra `cuda` is installed. A nominal control is clipped only if
+            theta is planar, and rows are relaxed only in the plane.
 
     Raises:
         InputError: the measurement has no velocities, they are not finite for an observed robot, the measurement does
@@ -212,7 +208,12 @@ def evidence(
 
 def read_sample(model: ObservationModel, sample: Sample, compiled: bool | None) -> Evidence:
     """`evidence` of a sample that is already evaluated."""
-    return (_compiled if _can_be_compiled(model, sample, compiled) else _in_torch)(model, sample)
+    if not compiled_evidence.can_be_compiled(model, sample, compiled):
+        return _in_torch(model, sample)
+    omega, (informative, alarmed, infeasible, slack, excess), solved = compiled_evidence.read(model, sample)
+    return Evidence(
+        omega, informative, alarmed, infeasible, slack, excess, sample.hard, lambda: solved, sample.omega_without(model)
+    )
 
 
 def sample_of(model: ObservationModel, theta: FeasibleSet, measurement: Measurement) -> Sample:
@@ -300,51 +301,4 @@ def _in_torch(model: ObservationModel, sample: Sample) -> Evidence:
     omega = omega.where(informative.unsqueeze(-1))
     return Evidence(
         omega, informative, alarmed, infeasible, slack, excess, sample.hard, solve, sample.omega_without(model)
-    )
-
-
-def _can_be_compiled(model: ObservationModel, sample: Sample, wanted: bool | None) -> bool:
-    if wanted is False:
-        return False
-    tensors = [sample.rows.A, sample.rows.b, sample.C, sample.d, sample.u, sample.bound, sample.ball, sample.drift]
-    if model.task.saturation is not None and sample.corners is not None:
-        tensors.append(sample.corners)
-    obstacle, in_space, clipped = None, sample.rows.dim == 3, model.task.saturation is not None
-    if sample.rows.dim not in (2, 3):
-        obstacle = "controls are neither in the plane nor in space"
-    elif clipped and not sample.rows.dim == sample.C.shape[-1] == 2:
-        obstacle = "the nominal control is clipped, and theta is not planar"
-    elif in_space and bool(sample.relaxed.any()):
-        obstacle = "rows are relaxed, in space"
-    elif torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
-        obstacle = "gradients are required"
-    elif not all(tensor.is_cpu for tensor in tensors):
-        obstacle = "tensors are not on the CPU"
-    if wanted and obstacle is not None:
-        raise InputError("compiled", "False or None", f"True, but {obstacle}")
-    return obstacle is None
-
-
-def _compiled(model: ObservationModel, sample: Sample) -> Evidence:
-    angles = sample.u[:, :0] if sample.row_errors is None else sample.row_errors.angle
-    rows, relaxed = (sample.rows.A, sample.rows.b, sample.hard), (sample.relaxed,)
-    others = (
-        sample.C, sample.d, sample.u, sample.usable,
-        torch.atleast_2d(sample.bound), angles, torch.atleast_1d(sample.ball), torch.atleast_1d(sample.drift),
-    )  # fmt: skip
-    saturation, paper, clip = model.task.saturation, model.kind == "critical_region", NO_CLIP
-    if sample.rows.dim == 3:
-        found = evidence_in_space(*map(array, rows + others), paper, model.active_tolerance)
-    else:
-        if saturation is not None:
-            assert sample.corners is not None
-            limits = np.array(saturation.limits, dtype=np.float64)
-            clip = limits, saturation.shape == "norm", float(saturation.dead_speed), array(sample.corners)
-        found = kernel.evidence(*map(array, rows + relaxed + others), clip, paper, model.active_tolerance)
-    half_spaces, judged, kkt = found
-    informative, alarmed, infeasible, slack, excess = map(torch.from_numpy, judged)
-    solved = KktSolution(*map(torch.from_numpy, kkt))
-    omega = Halfspaces(*map(torch.from_numpy, half_spaces))
-    return Evidence(
-        omega, informative, alarmed, infeasible, slack, excess, sample.hard, lambda: solved, sample.omega_without(model)
     )

@@ -23,6 +23,9 @@ import numba
 from numba import njit
 from numba.extending import register_jitable
 
+SIMULATED = bool(numba.config.ENABLE_CUDASIM)  # type: ignore[attr-defined]
+"""Does numba's simulator stand for a GPU (NUMBA_ENABLE_CUDASIM=1)?"""
+
 _OPTIONS: dict[str, Any] = {"error_model": "numpy"}  # a division by zero is infinite or NaN, as in numpy
 
 

@@ -252,6 +252,46 @@ def inverse_optimal(k, m, u, ball, C, d, normals, generator, count, none, row_A,
         row_source[k, n] = 2 * m if generator[n] == none else m + generator[n] % m
 
 
+@item
+@no_type_check
+def read_one(k, rows, sample, angles, fan, around, relaxes, paper, active_tolerance, scratch, judged, kkt):
+    """Fill the places of robot k in `judged` and `kkt`, results of `evidence`, and its normals. Returns their number.
+
+    It is -1 if the robot is not informative.
+    """
+    A, b, hard, relaxed = rows
+    C, d, u, usable, bound = sample
+    unit, unit_b, near, angle, order, normals, generator = scratch
+    informative, alarmed, infeasible, slack, excess = judged
+    G, f, projector, free, offset, active, n_active, rank, case = kkt
+    known, broken, strained, blind = judge(
+        k, A, b, hard, relaxed, u, bound, angles, active_tolerance, unit, unit_b, slack, excess, active, near
+    )
+    wish_known = is_finite(k, C, d)
+    usable_here = usable[k] and known and wish_known
+    alarmed[k], informative[k] = usable_here and broken, usable_here and not broken and not blind
+    K, rank[k] = solve_active(k, unit, unit_b, active, offset, projector)
+    n_active[k], case[k] = K, K if K < 2 else 2 if rank[k] < 2 else 3 if K == 2 else 4
+    solve_motion(k, C, d, wish_known, rank[k], offset, projector, free, G, f)
+    if not (informative[k] or (relaxes and usable_here and not broken)):
+        return -1
+    found = find_generators(k, unit, active[k] if paper else near, fan, angle, order)
+    count, opening = outward_normals(angle, order, found, len(order), around, normals, generator)
+    if relaxes:
+        pointed = opening > 0 and not blind
+        alarmed[k] = strained and not blind and opening > RELAXED_OPENING
+        informative[k] = pointed and not strained
+        infeasible[k] = not alarmed[k] and not informative[k]
+    return count if informative[k] else -1
+
+
+@item
+@no_type_check
+def rows_for(m, paper, clips):
+    """The number of half-spaces, padding included, that follow from m rows."""
+    return ROWS if clips else m + CRITICAL_NORMALS + 1 if paper else NORMALS + 1
+
+
 @launcher
 @no_type_check
 def evidence(A, b, hard, relaxed, C, d, u, usable, bound, angles, ball, drift, clip, paper, active_tolerance):
@@ -279,57 +319,32 @@ def evidence(A, b, hard, relaxed, C, d, u, usable, bound, angles, ball, drift, c
         Half-spaces (A, b, source), padded. Then (informative, alarmed, infeasible, slack, excess), as in `Evidence`.
         Then (G, f, projector, free, offset, active, n_active, rank, case), as in `KktSolution`.
     """
-    B, m = b.shape
-    fan = angles[:, :0] if paper else angles
+    (B, m), fan = b.shape, angles[:, :0] if paper else angles
     generators = m * len(SPREAD) if fan.shape[1] > 0 else m
-    around = CRITICAL_DIRECTIONS if paper else DIRECTIONS
-    clips, work = len(clip[0]) > 0, workspace(clip[3].shape[1])
-    R = ROWS if clips else (m if paper else 0) + len(around) + 1
-    row_A, row_b, row_source = np.zeros((B, R, C.shape[2])), np.ones((B, R)), np.full((B, R), -1)
-    informative, alarmed, infeasible = np.empty(B, np.bool_), np.empty(B, np.bool_), np.zeros(B, np.bool_)
-    slack, excess = np.empty((B, m)), np.empty((B, m))
-    G, f, projector, free = np.zeros((B, 2, C.shape[2])), np.zeros((B, 2)), np.zeros((B, 2, 2)), np.zeros((B, 2, 2))
-    offset, active = np.zeros((B, 2)), np.empty((B, m), np.bool_)
-    n_active, rank, case = np.empty(B, np.int64), np.empty(B, np.int64), np.empty(B, np.int64)
-    unit, unit_b, near = np.zeros((m, 2)), np.empty(m), np.empty(m, np.bool_)
-    angle, order = np.empty(generators), np.empty(generators, np.int64)
-    normals, generator = np.empty((len(around) + 1, 2)), np.empty(len(around) + 1, np.int64)
-    relaxes = relaxed.any()
+    around, work = CRITICAL_DIRECTIONS if paper else DIRECTIONS, workspace(clip[3].shape[1])
+    R = rows_for(m, paper, len(clip[0]) > 0)
+    half_spaces = np.zeros((B, R, C.shape[2])), np.ones((B, R)), np.full((B, R), -1)
+    judged = np.empty(B, np.bool_), np.empty(B, np.bool_), np.zeros(B, np.bool_), np.empty((B, m)), np.empty((B, m))
+    kkt = (
+        np.zeros((B, 2, C.shape[2])), np.zeros((B, 2)), np.zeros((B, 2, 2)), np.zeros((B, 2, 2)), np.zeros((B, 2)),
+        np.empty((B, m), np.bool_), np.empty(B, np.int64), np.empty(B, np.int64), np.empty(B, np.int64),
+    )  # fmt: skip
+    scratch = (
+        np.zeros((m, 2)), np.empty(m), np.empty(m, np.bool_), np.empty(generators), np.empty(generators, np.int64),
+        np.empty((len(around) + 1, 2)), np.empty(len(around) + 1, np.int64),
+    )  # fmt: skip
+    rows, sample, relaxes = (A, b, hard, relaxed), (C, d, u, usable, bound), relaxed.any()
     for k in range(B):
-        known, broken, strained, blind = judge(
-            k, A, b, hard, relaxed, u, bound, angles, active_tolerance, unit, unit_b, slack, excess, active, near
-        )
-        wish_known = is_finite(k, C, d)
-        usable_here = usable[k] and known and wish_known
-        alarmed[k], informative[k] = usable_here and broken, usable_here and not broken and not blind
-        K, rank[k] = solve_active(k, unit, unit_b, active, offset, projector)
-        n_active[k], case[k] = K, K if K < 2 else 2 if rank[k] < 2 else 3 if K == 2 else 4
-        solve_motion(k, C, d, wish_known, rank[k], offset, projector, free, G, f)
-        if not (informative[k] or (relaxes and usable_here and not broken)):
+        count = read_one(k, rows, sample, angles, fan, around, relaxes, paper, active_tolerance, scratch, judged, kkt)
+        if count < 0:
             continue
-        found = find_generators(k, unit, active[k] if paper else near, fan, angle, order)
-        count, opening = outward_normals(angle, order, found, generators, around, normals, generator)
-        if relaxes:
-            pointed = opening > 0 and not blind
-            alarmed[k] = strained and not blind and opening > RELAXED_OPENING
-            informative[k] = pointed and not strained
-            infeasible[k] = not alarmed[k] and not informative[k]
-            if not informative[k]:
-                continue
+        of = *scratch[5:], count
         if paper:
-            critical_region(
-                k, unit, unit_b, C, d, G, f, projector, offset, active, normals, generator, count,
-                row_A, row_b, row_source,
-            )  # fmt: skip
+            critical_region(k, *scratch[:2], C, d, *kkt[:3], *kkt[4:6], *of, *half_spaces)
         else:
             room, shift = ball[min(k, len(ball) - 1)], drift[min(k, len(drift) - 1)]
-            of = normals, generator, count, generators
-            if clips:
-                clipped_inverse_optimal(k, m, u, room, shift, C, d, clip, *of, work, row_A, row_b, row_source)
+            if len(clip[0]) > 0:
+                clipped_inverse_optimal(k, m, u, room, shift, C, d, clip, *of, generators, work, *half_spaces)
             else:
-                inverse_optimal(k, m, u, room + shift, C, d, *of, row_A, row_b, row_source)
-    return (
-        (row_A, row_b, row_source),
-        (informative, alarmed, infeasible, slack, excess),
-        (G, f, projector, free, offset, active, n_active, rank, case),
-    )
+                inverse_optimal(k, m, u, room + shift, C, d, *of, generators, *half_spaces)
+    return half_spaces, judged, kkt

@@ -41,7 +41,7 @@ def box_of(vertices, k, n):
 
 @item_of_ordered
 @no_type_check
-def _beyond(vertices, k, n, p, q, c):
+def most_beyond(vertices, k, n, p, q, c):
     """The largest distance by which a vertex exceeds the line (p, q).z = c."""
     most = -np.inf
     for i in range(n):
@@ -60,7 +60,7 @@ def exceeded(vertices, k, n, reach, box, p, q, c):
     x0, x1, y0, y1 = box
     if p * (x1 if p > 0 else x0) + q * (y1 if q > 0 else y0) - c > 0:
         tolerance = ROUND_OFF * (abs(p) * reach[k, 0] + abs(q) * reach[k, 1] + abs(c))
-        beyond = _beyond(vertices, k, n, p, q, c)
+        beyond = most_beyond(vertices, k, n, p, q, c)
         if beyond > tolerance:
             return beyond, tolerance
     return 0.0, 0.0
@@ -204,6 +204,68 @@ def _cross(points, k, ring, over, inner, outer):
         points[k, i] = ring[inner, i] + share * (ring[outer, i] - ring[inner, i])
 
 
+@item
+@no_type_check
+def cut_one(k, polygons, A, b, most, scratch):
+    """Cut polygon k by its rows, as `cut_ring` does. The new ring, its edges and their lines are in `scratch`."""
+    vertices, ring_A, ring_b, _, _, _, count, reach = polygons
+    ring, edge, lines, tolerance, depth, cutting, over, spare, spare_edge = scratch
+    n, V = count[k], ring_b.shape[1]
+    cuts = mark_cuts(vertices, k, n, reach, A, b, tolerance, depth, cutting)
+    if cuts == 0:
+        return n, OK, False, -1, -1, -1
+    for i in range(n):
+        ring[i, 0], ring[i, 1], edge[i] = vertices[k, i, 0], vertices[k, i, 1], i
+        lines[i, 0], lines[i, 1], lines[i, 2] = ring_A[k, i, 0], ring_A[k, i, 1], ring_b[k, i]
+    for s in range(cuts):
+        r = cutting[s]
+        lines[V + r, 0], lines[V + r, 1], lines[V + r, 2] = A[k, r, 0], A[k, r, 1], b[k, r]
+    n, outcome, shrunk, row, before, after = cut_ring(
+        ring, edge, n, lines, V, reach[k], tolerance, cutting, cuts, over, spare, spare_edge
+    )
+    if shrunk and n > most:
+        n = merge_ring(ring, edge, n, most, lines, spare, spare_edge)
+        # Each area carries the round-off of its sum.
+        shrunk = area_of(ring, n) <= area_of(vertices[k], count[k]) * (1 - ROUND_OFF)
+    return n, outcome, shrunk, row, before, after
+
+
+@item
+@no_type_check
+def keep_ring(k, n, polygons, stamp, source, scratch, marks, result):
+    """Write the ring that `cut_one` left in `scratch` to polygon k of `result`.
+
+    With `marks`, the label of an edge from row r is -1 - (k R + r) until it gets its own. Otherwise it is 0.
+    """
+    (time, ring_source, label), (ring, edge, lines) = polygons[3:6], scratch[:3]
+    to_vertices, to_A, to_b, to_time, to_source, to_label, to_count, _ = result
+    V, R = time.shape[1], stamp.shape[1]
+    to_count[k] = n
+    for i in range(n):
+        to_vertices[k, i, 0], to_vertices[k, i, 1] = ring[i, 0], ring[i, 1]
+        e = edge[i]
+        to_A[k, i, 0], to_A[k, i, 1], to_b[k, i] = lines[e, 0], lines[e, 1], lines[e, 2]
+        if e < V:
+            to_time[k, i], to_source[k, i], to_label[k, i] = time[k, e], ring_source[k, e], label[k, e]
+        else:
+            to_time[k, i], to_source[k, i] = stamp[k, e - V], source[k, e - V]
+            to_label[k, i] = -1 - (k * R + e - V) if marks else 0
+    _pad(result, k, n)
+
+
+@item
+@no_type_check
+def keep_contradiction(k, found, polygons, stamp, source, lines, lost):
+    """Write the three lines `found` that contradict each other to item k of `lost`: A, b, time and source."""
+    time, ring_source = polygons[3], polygons[4]
+    lost_A, lost_b, lost_time, lost_source = lost
+    V = time.shape[1]
+    for i, e in enumerate(found):
+        lost_A[k, i, 0], lost_A[k, i, 1], lost_b[k, i] = lines[e, 0], lines[e, 1], lines[e, 2]
+        lost_time[k, i] = time[k, e] if e < V else stamp[k, e - V]
+        lost_source[k, i] = ring_source[k, e] if e < V else source[k, e - V]
+
+
 @launcher
 @no_type_check
 def clip(polygons, A, b, stamp, source, first_label, most):
@@ -215,80 +277,35 @@ def clip(polygons, A, b, stamp, source, first_label, most):
 
     Returns (polygons, outcome, shrunk, entered, contradiction). If none was cut, the polygons are not copied.
     """
-    vertices, ring_A, ring_b, time, ring_source, label, count, reach = polygons
-    (B, R), V = b.shape, ring_b.shape[1]
+    (B, R), V = b.shape, polygons[2].shape[1]
     W = V + R + 1
-    tolerance, depth, cutting, over = np.empty(R), np.empty(R), np.empty(R, np.int64), np.empty(W)
-    ring, spare, lines = np.empty((W, 2)), np.empty((W, 2)), np.empty((W, 3))
-    edge, spare_edge = np.empty(W, np.int64), np.empty(W, np.int64)
+    scratch = (
+        np.empty((W, 2)), np.empty(W, np.int64), np.empty((W, 3)),
+        np.empty(R), np.empty(R), np.empty(R, np.int64), np.empty(W), np.empty((W, 2)), np.empty(W, np.int64),
+    )  # fmt: skip
     result, slots, new = polygons, 0, 0
     entered = np.empty(B * R if first_label > 0 else 0, np.int64)
-    to_vertices, to_A, to_b, to_time, to_source, to_label, to_count, _ = polygons
     outcome, shrunk = np.zeros(B, np.int64), np.zeros(B, np.bool_)
-    lost_A, lost_b = np.full((B, 3, 2), np.nan), np.full((B, 3), np.nan)
-    lost_time, lost_source = np.full((B, 3), np.nan), np.full((B, 3), -1)
+    lost = np.full((B, 3, 2), np.nan), np.full((B, 3), np.nan), np.full((B, 3), np.nan), np.full((B, 3), -1)
     for k in range(B):
-        n = count[k]
-        cuts = mark_cuts(vertices, k, n, reach, A, b, tolerance, depth, cutting)
-        if cuts > 0:
-            for i in range(n):
-                ring[i, 0], ring[i, 1], edge[i] = vertices[k, i, 0], vertices[k, i, 1], i
-                lines[i, 0], lines[i, 1], lines[i, 2] = ring_A[k, i, 0], ring_A[k, i, 1], ring_b[k, i]
-            for s in range(cuts):
-                r = cutting[s]
-                lines[V + r, 0], lines[V + r, 1], lines[V + r, 2] = A[k, r, 0], A[k, r, 1], b[k, r]
-            n, outcome[k], shrunk[k], row, before, after = cut_ring(
-                ring, edge, n, lines, V, reach[k], tolerance, cutting, cuts, over, spare, spare_edge
-            )
+        n, outcome[k], shrunk[k], row, before, after = cut_one(k, polygons, A, b, most, scratch)
         if outcome[k] == EMPTY:
-            for i, e in enumerate((row, before, after)):
-                lost_A[k, i, 0], lost_A[k, i, 1] = lines[e, 0], lines[e, 1]
-                lost_b[k, i] = lines[e, 2]
-                lost_time[k, i] = time[k, e] if e < V else stamp[k, e - V]
-                lost_source[k, i] = ring_source[k, e] if e < V else source[k, e - V]
-        if shrunk[k] and n > most:
-            n = merge_ring(ring, edge, n, most, lines, spare, spare_edge)
-            # Each area carries the round-off of its sum.
-            shrunk[k] = area_of(ring, n) <= area_of(vertices[k], count[k]) * (1 - ROUND_OFF)
+            keep_contradiction(k, (row, before, after), polygons, stamp, source, scratch[2], lost)
         if not shrunk[k]:
             if slots > 0:
-                _copy(polygons, k, result)
+                copy_polygon(polygons, k, result)
             continue
         if n > slots:  # seldom: slots grow by eight, and the polygons before this one are copied
             slots = max((n + 7) // 8 * 8, V)
             result = _widened(result, k, slots)
-            to_vertices, to_A, to_b, to_time, to_source, to_label, to_count, _ = result
-        to_count[k] = n
-        for i in range(n):
-            to_vertices[k, i, 0], to_vertices[k, i, 1] = ring[i, 0], ring[i, 1]
-            e = edge[i]
-            to_A[k, i, 0], to_A[k, i, 1], to_b[k, i] = lines[e, 0], lines[e, 1], lines[e, 2]
-            if e < V:
-                to_time[k, i], to_source[k, i], to_label[k, i] = time[k, e], ring_source[k, e], label[k, e]
-            else:
-                to_time[k, i], to_source[k, i] = stamp[k, e - V], source[k, e - V]
-                to_label[k, i] = 0
-                if first_label > 0:
-                    to_label[k, i], entered[new] = first_label + new, k * R + e - V
+        keep_ring(k, n, polygons, stamp, source, scratch, first_label > 0, result)
+        if first_label > 0:
+            label = result[5]
+            for i in range(n):
+                if label[k, i] < 0:
+                    label[k, i], entered[new] = first_label + new, -1 - label[k, i]
                     new += 1
-        _pad(result, k, n)
-    return result, outcome, shrunk, entered[:new], (lost_A, lost_b, lost_time, lost_source)
-
-
-@launcher
-@no_type_check
-def moved_around(vertices, count, reach, A, b):
-    """The bounds (B, R) of the rows A (B, R, 2), b, moved outward until row r of item k holds polygon k, rounded up."""
-    moved = b.copy()
-    for k in range(len(b)):
-        n = count[k]
-        x0, x1, y0, y1 = box_of(vertices, k, n)
-        for r in range(b.shape[1]):
-            p, q, c = A[k, r, 0], A[k, r, 1], b[k, r]
-            round_off = ROUND_OFF * (abs(p) * reach[k, 0] + abs(q) * reach[k, 1] + abs(c))
-            if p * (x1 if p > 0 else x0) + q * (y1 if q > 0 else y0) + round_off > c:
-                moved[k, r] = max(c, c + _beyond(vertices, k, n, p, q, c) + round_off)
-    return moved
+    return result, outcome, shrunk, entered[:new], lost
 
 
 @launcher
@@ -302,13 +319,13 @@ def _widened(polygons, done, slots):
         np.empty((B, slots), np.int64), np.empty((B, slots), np.int64), count.copy(), reach,
     )  # fmt: skip
     for k in range(done):
-        _copy(polygons, k, wide)
+        copy_polygon(polygons, k, wide)
     return wide
 
 
 @item
 @no_type_check
-def _copy(polygons, k, wide):
+def copy_polygon(polygons, k, wide):
     """Copy polygon k to arrays with as many slots or more."""
     vertices, A, b, time, source, label, count, _ = polygons
     to_vertices, to_A, to_b, to_time, to_source, to_label, to_count, _ = wide

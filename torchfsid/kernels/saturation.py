@@ -30,14 +30,23 @@ ROWS = CRITICAL_NORMALS + NORMALS
 """The largest number of half-spaces of y: around a cone, and those of Q."""
 
 
+BOUNDS = NORMALS + 1
+"""The largest number of rows of Q."""
+
+TOUCHING = SAMPLED + 2 * BOUNDS
+"""The largest number of directions in which Q touches the limit."""
+
+POINTS = TOUCHING + BOUNDS
+"""The largest number of points of P."""
+
+
 @launcher
 @no_type_check
 def workspace(slots):
     """Arrays for one robot with `slots` vertices of Theta: C theta + d at these; the bounds of Q; the directions in
     which Q touches the limit; the points of P; the half-spaces of y."""
-    most = SAMPLED + 2 * (NORMALS + 1)
     rows = np.empty((ROWS, 2)), np.empty(ROWS), np.empty(ROWS, np.int64)
-    return np.empty((slots, 2)), np.empty(NORMALS + 1), np.empty((most, 2)), np.empty((most + NORMALS + 1, 2)), rows
+    return np.empty((slots, 2)), np.empty(BOUNDS), np.empty((TOUCHING, 2)), np.empty((POINTS, 2)), rows
 
 
 @item

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchfsid.halfspaces import Halfspaces, array, dot
-from torchfsid.kernels import polygon as kernel
+from torchfsid.kernels import around as kernel
 from torchfsid.sets.feasible_set import FeasibleSet
 from torchfsid.tolerances import ROUND_OFF
 

@@ -135,7 +135,7 @@ class FeasibleSet:
 
     @cached_property
     def any_empty(self) -> bool:
-        return bool((array(self.outcome) == Status.EMPTY).any())
+        return bool(((array(self.outcome) if self.outcome.is_cpu else self.outcome) == Status.EMPTY).any())
 
     def intersect(self, halfspaces: Halfspaces, time: float | Float[Tensor, "*#batch m"] = nan) -> FeasibleSet:
         """The part of the set inside the half-spaces.

@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchfsid import device
 from torchfsid.halfspaces import Halfspaces, array
 from torchfsid.kernels import disc, extent, foot
 from torchfsid.kernels import polygon as kernel
@@ -139,20 +140,46 @@ class Polygon:
         """See `Body.clip`. An edge with parallel neighbours, as in a parallelogram, is never merged."""
         differentiable = torch.is_grad_enabled() and (A.requires_grad or b.requires_grad)
         first = 1 + self.sheets.rows if differentiable else 0
+        if b.shape[1] > 0 and device.has_kernels(A, b, self.b):
+            return self._clipped_on_device(A, b, time, source, most, first)
         parts, outcome, shrunk, entered, against = kernel.clip(
             tuple(map(array, self.fields())), array(A), array(b), array(time), array(source), first, most
         )
-        device = A.device
-        contradiction = Contradiction(*(torch.from_numpy(part).to(device) for part in against))
-        outcomes, smaller = torch.from_numpy(outcome).to(device), torch.from_numpy(shrunk).to(device)
+        where = A.device
+        contradiction = Contradiction(*(torch.from_numpy(part).to(where) for part in against))
+        outcomes, smaller = torch.from_numpy(outcome).to(where), torch.from_numpy(shrunk).to(where)
         if not shrunk.any():
             return Clipped(self, outcomes, smaller, contradiction)
-        sheets = self.sheets
+        body = Polygon(*(torch.from_numpy(part).to(where) for part in parts), sheets=self.sheets)
         if differentiable:
-            rows = torch.from_numpy(entered).to(device)
-            sheets = sheets.with_sheet(A.flatten(0, 1).index_select(0, rows), b.flatten().index_select(0, rows))
-        body = Polygon(*(torch.from_numpy(part).to(device) for part in parts), sheets=sheets)
+            body = body._with_sheet(A, b, torch.from_numpy(entered).to(where))
         return Clipped(body._pruned(), outcomes, smaller, contradiction)
+
+    def _clipped_on_device(self, A: Tensor, b: Tensor, time: Tensor, source: Tensor, most: int, first: int) -> Clipped:
+        """`clip` by the device's kernel. Nothing waits for its results, except gradients for the rows that entered."""
+        (B, R), ints = b.shape, torch.long
+        V = max(self.slots, min(self.slots + R, most))
+        ring = *(device.empty((B, V, 2), b) for _ in range(2)), *(device.empty((B, V), b) for _ in range(2))
+        numbers = *(device.empty((B, V), b, ints) for _ in range(2)), device.empty((B,), b, ints)
+        found = device.empty((B,), b, ints), device.empty((B,), b, torch.bool)
+        lost = (
+            device.empty((B, 3, 2), b), device.empty((B, 3), b), device.empty((B, 3), b), device.empty((B, 3), b, ints),
+        )  # fmt: skip
+        parts = *ring, *numbers, self.reach
+        rows = A, b, time, source
+        device.launch("clip", (self.fields(), rows), (most, first > 0), (parts, found, lost))
+        body = Polygon(*parts, sheets=self.sheets)
+        if first > 0:
+            new = (body.label < 0).nonzero(as_tuple=True)
+            entered = -1 - body.label[new]
+            body.label[new] = torch.arange(first, first + len(entered), device=b.device)
+            body = body._with_sheet(A, b, entered)
+        return Clipped(body._pruned(), *found, Contradiction(*lost))
+
+    def _with_sheet(self, A: Tensor, b: Tensor, entered: Int[Tensor, "N"]) -> Polygon:
+        """This batch with the rows `entered` of all rows as one more sheet."""
+        rows = A.flatten(0, 1).index_select(0, entered), b.flatten().index_select(0, entered)
+        return replace(self, sheets=self.sheets.with_sheet(*rows))
 
     # Geometry -------------------------------------------------------------------------------------------------------
 

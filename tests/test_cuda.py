@@ -1,0 +1,48 @@
+"""The kernels for a GPU, on a CPU: numba's simulator runs them where it is asked for before numba is imported."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchfsid import device
+
+
+def test_on_the_simulator() -> None:
+    """All tests of `simulated_cuda.py`, in a process of their own."""
+    tests = Path(__file__).with_name("simulated_cuda.py")
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", str(tests)]
+    environment = {**os.environ, "NUMBA_ENABLE_CUDASIM": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=tests.parent.parent)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.fixture
+def anew() -> None:
+    device.missing.cache_clear()
+
+
+@pytest.mark.usefixtures("anew")
+def test_what_is_missing_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tensors on the CPU never take the kernels of the device. What is missing for the others is said in words."""
+    numbers = torch.zeros(2)
+    assert not device.has_kernels(numbers)
+
+    class Broken:
+        @staticmethod
+        def probe() -> None:
+            return np.no_such_function  # type: ignore[attr-defined]
+
+    monkeypatch.setattr(device, "import_module", lambda name: Broken)
+    try:
+        reason = device.missing()
+    finally:
+        device.missing.cache_clear()
+    assert "no_such_function" in reason
+    assert "torchfsid[cuda]" in reason

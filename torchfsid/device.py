@@ -1,0 +1,66 @@
+"""Tensors on a GPU and the kernels there: when these can be used, and the way of tensors to them, which copies nothing.
+
+Kernels on a device need the extra `cuda`. With NUMBA_ENABLE_CUDASIM=1 they run in numba's simulator, slowly, and
+tensors on the CPU stand for those on a device: that is for tests.
+
+The first index of a batch counts items. A kernel's neighbouring threads handle neighbouring items, so tensors for
+kernels are laid out with neighbouring items side by side in memory (stride 1), and so are the results.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from importlib import import_module
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchfsid.kernels.compiled import SIMULATED
+
+INSTALL = "pip install 'torchfsid[cuda]', with numba-cuda[cu12] or [cu13] where there is no CUDA toolkit"
+
+
+@cache
+def missing() -> str:
+    """Why there are no kernels for the device. It is empty if there are."""
+    try:
+        kernels = import_module("torchfsid.kernels.cuda")
+        kernels.probe()
+    except (ImportError, AttributeError, RuntimeError) as error:
+        return f"numba cannot use the device ({error}; {INSTALL})"
+    return "" if kernels.cuda.is_available() else f"numba finds no driver or no compiler for the device ({INSTALL})"
+
+
+def has_kernels(*tensors: Tensor) -> bool:
+    """Are all tensors on a device that has kernels?"""
+    return (SIMULATED or all(tensor.is_cuda for tensor in tensors)) and not missing()
+
+
+def launch(kernel: str, tensors: Sequence[Sequence[Tensor]], values: Sequence[Any], results: Any) -> None:
+    """Run a function of `kernels.cuda`, called with the tensors, the values and the results, which it fills."""
+    function: Callable = getattr(import_module("torchfsid.kernels.cuda"), kernel)
+    given = [tuple(map(side_by_side, part)) for part in tensors]
+    filled = [tuple(map(_array, part)) for part in results]
+    if SIMULATED:
+        function(given, values, filled)
+        return
+    where = results[0][0].device
+    with torch.cuda.device(where):
+        function(given, values, filled, torch.cuda.current_stream(where).cuda_stream)
+
+
+def empty(shape: Sequence[int], like: Tensor, dtype: torch.dtype = torch.float64) -> Tensor:
+    """A tensor on the device of another, with neighbouring items side by side. It is not filled."""
+    first, *others = shape
+    return torch.empty((*others, first), dtype=dtype, device=like.device).movedim(-1, 0)
+
+
+def side_by_side(tensor: Tensor) -> Any:
+    """The numbers of a tensor as kernels take them. They are copied on the device unless neighbours are adjacent."""
+    return _array(tensor.detach().movedim(0, -1).contiguous().movedim(-1, 0))
+
+
+def _array(tensor: Tensor) -> Any:
+    return tensor.numpy() if SIMULATED else tensor
