@@ -15,6 +15,7 @@ from torchfsid.halfspaces import Halfspaces
 from torchfsid.observers.hybrid import CONDITION, HybridObserver
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.observers.ukf import ParameterUkf, UkfEstimate
+from torchfsid.observers.ukf_estimates import UkfEstimates
 from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.controller import CbfQpController
@@ -47,8 +48,9 @@ class Dictated(ParameterUkf):
 
     says: UkfEstimate = field(kw_only=True)
 
-    def update(self, measurement: Measurement) -> UkfEstimate:
-        return self.says
+    def read(self, samples: Measurement) -> UkfEstimates:
+        said = self.says
+        return UkfEstimates(torch.tensor([said.t]).double(), said.theta[None], said.covariance[None], said.status[None])
 
 
 def projected(sets: FeasibleSet, theta: Tensor, covariance: Tensor) -> Tensor:
@@ -61,7 +63,7 @@ def projected(sets: FeasibleSet, theta: Tensor, covariance: Tensor) -> Tensor:
     x, bodies = torch.zeros(robots, 2).double(), torch.zeros(robots, 1, 2).double()
     none = torch.zeros(robots, dtype=torch.bool)
     answer = HybridObserver(observer, ukf).update(Measurement(0.0, x, x, bodies, none.unsqueeze(-1), observed=none))
-    assert answer.ukf_estimate is estimate
+    assert torch.equal(answer.ukf_estimate.theta, theta)
     return answer.theta
 
 

@@ -143,8 +143,7 @@ def test_no_gradient_is_nan():
     (point, of_point), ball = EXACT_POINT(halfspaces, y), EXACT_BALL(halfspaces)
     assert point[of_point == Status.OK].isfinite().all()
     assert ball.centre[ball.status == Status.OK].isfinite().all()
-    counts = ball.status.bincount(minlength=3)
-    assert (counts[:3] > 20).all()
+    assert all(int((ball.status == status).sum()) > 20 for status in (Status.OK, Status.EMPTY, Status.UNBOUNDED))
     for answer in (point, ball.centre, ball.radius):
         for gradient in torch.autograd.grad(answer.sum(), leaves, retain_graph=True, allow_unused=True):
             assert gradient is None or gradient.isfinite().all()

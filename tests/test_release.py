@@ -47,7 +47,7 @@ def test_help_says_how_to_begin(capsys):
     """Examples, what the statuses mean, exit codes and how lists are overridden."""
     assert "torchfsid init run.csv" in said(capsys, "--help")
     observe = said(capsys, "observe", "--help")
-    for status in Status:
+    for status in (Status.OK, Status.ALARM, Status.INCONSISTENT):
         assert f"\n  {status.name.lower()} " in observe
     assert "exit codes" in observe
     assert "barriers.0" in observe
