@@ -61,6 +61,8 @@ def test_an_empty_set_stays_empty_in_a_part() -> None:
 def test_a_set_is_built_again_from_its_halfspaces(p: int) -> None:
     sets = random_sets(3, p)
     again = fsid.FeasibleSet.from_halfspaces(sets.halfspaces())
+    pair = fsid.FeasibleSet.from_halfspaces((sets.halfspaces().A, sets.halfspaces().b))
+    assert torch.equal(pair.volume(), again.volume())
     torch.testing.assert_close(again.volume(), sets.volume())
     torch.testing.assert_close(again.centroid(), sets.centroid())
     assert (again.facets().source >= 0)[(again.facets().halfspaces.A != 0).any(-1)].all()

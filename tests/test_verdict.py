@@ -311,6 +311,11 @@ def test_the_bound_that_is_found_is_not_scanned() -> None:
 # Truth, and what results are made from ------------------------------------------------------------------------------
 
 
+def test_a_log_is_shown_in_a_line(log: Log) -> None:
+    assert repr(log).startswith(f"Log({log.source!r}, bodies=['ann', 'bob'")
+    assert f"times={len(log.t)}, t=0 to {log.t[-1]:.15g} s, with x, u)" in repr(log)
+
+
 def test_the_truth_marks_and_changes_nothing(log: Log, tmp_path: Path) -> None:
     truth = {"ann": GOALS["ann"], "bob": [1.0, 1.0]}
     folders = {}
@@ -319,6 +324,9 @@ def test_the_truth_marks_and_changes_nothing(log: Log, tmp_path: Path) -> None:
         folders[name].mkdir()
         observation = Observation(declared(log, **changes))
         observation.run(folders[name])
+    shown = Console(record=True, width=300, file=io.StringIO())
+    print_verdicts(observation, folders["with"], shown)
+    assert "The truth of bob is outside although the status is ok" in shown.export_text()
     assert [verdict.holds_truth for verdict in observation.verdicts()] == [True, False, None]
     for file in ("estimates.csv", "sets.csv", "motion.csv"):
         assert (folders["with"] / file).read_bytes() == (folders["without"] / file).read_bytes()

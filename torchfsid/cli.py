@@ -73,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", required=True)
 
     def command(name: str, what: str, epilog: str) -> argparse.ArgumentParser:
-        return commands.add_parser(name, help=what, description=f"{what}.", epilog=epilog, formatter_class=shaped)
+        return commands.add_parser(name, help=what, description=what, epilog=epilog, formatter_class=shaped)
 
     start = command("init", "write a commented config for a log", STARTED)
     observe = command("observe", "infer the sets of a log's robots", OBSERVED)

@@ -107,6 +107,7 @@ def draw_map(
             axes.plot(*theta, "*", **star)
             handles["truth"] = Line2D([], [], marker="*", **{**star, "color": "0.6"})
     axes.set(xlabel="x [m]", ylabel="y [m]")
+    axes.ticklabel_format(useOffset=False, style="plain")  # far from the origin, an offset would hide the legend
     axes.set_aspect("equal", adjustable="datalim")  # the map fills its place, however flat the data
     axes.margins(0.12)
     left, low = axes.dataLim.x0, axes.dataLim.y0

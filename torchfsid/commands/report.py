@@ -26,6 +26,9 @@ from torchfsid.outcome import Status
 MUCH = 0.1
 """Share of the typical control from which on a bound that `auto` found may hide an error of the model."""
 
+MOST_NAMED = 24
+"""Robots that a line names."""
+
 MOST_EVENTS = 8
 """Contradictions that are printed."""
 
@@ -37,7 +40,8 @@ DROPPED = ("cases", "centre", "skipped", "radius", "shrank last", "volume", "cen
 
 WRITTEN = (
     "estimates.csv", "sets.csv", "motion.csv", "regions.json", "config.yaml", "regions.png", "regions.pdf",
-    "safety.png", "safety.pdf",
+    "safety.png", "safety.pdf", "velocity_bound.json", "acceleration_bound.json", "unknown_numbers.json",
+    "task_gain.json", "report.html",
 )  # fmt: skip
 """Files that are named where they are there."""
 
@@ -142,10 +146,19 @@ def _sizes(verdict: Verdict) -> list[str]:
 def _print_trust(found: Sequence[Verdict], bound: JudgedBound, console: Console) -> None:
     """Print what the statuses mean."""
     if bad := [f"{verdict.robot} ({verdict.status})" for verdict in found if verdict.status != "ok"]:
-        said = f"Not to be trusted: {', '.join(bad)}. The model, the prior or a bound is wrong."
+        said = f"Not to be trusted: {_first(bad)}. The model, the prior or a bound is wrong."
+        console.print(red(escape(said)), soft_wrap=True)
+    if lost := [verdict.robot for verdict in found if verdict.status == "ok" and verdict.holds_truth is False]:
+        said = f"The truth of {_first(lost)} is outside although the status is ok: the model or a bound is wrong."
         console.print(red(escape(said)), soft_wrap=True)
     if not bound.is_useless and any(verdict.status == "ok" for verdict in found):
         console.print("ok: no contradiction was seen. That is no proof of the model.")
+
+
+def _first(named: Sequence[str]) -> str:
+    """The first of these, and how many there are beside them."""
+    more = len(named) - MOST_NAMED
+    return ", ".join(named[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _print_events(observation: Observation, found: Sequence[Verdict], console: Console) -> None:

@@ -72,6 +72,12 @@ class Log:
     reading: Reading = field(default_factory=Reading)
     frame: str | None = None
 
+    def __repr__(self) -> str:
+        shown, ends = reprlib.repr(list(self.bodies)), self.t[[0, -1]].tolist() if len(self.t) else []
+        span = " to ".join(f"{t:.15g}" for t in ends)
+        given = [name for name in ("u", "a", "radius", "heading") if getattr(self, name) is not None]
+        return f"Log({self.source!r}, bodies={shown}, times={len(self.t)}, t={span} s, with {', '.join(['x', *given])})"
+
     @property
     def with_headings(self) -> tuple[str, ...]:
         """The bodies of which some heading is known."""

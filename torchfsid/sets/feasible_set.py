@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchfsid.errors import InputError
-from torchfsid.halfspaces import Halfspaces, array, finite
+from torchfsid.halfspaces import Halfspaces, array, as_halfspaces, finite
 from torchfsid.kernels import extent
 from torchfsid.outcome import Status
 from torchfsid.programmes.differentiable import inscribed_ball, symmetric
@@ -83,13 +83,16 @@ class FeasibleSet:
         )
 
     @classmethod
-    def from_halfspaces(cls, halfspaces: Halfspaces, max_facets: int = MAX_FACETS) -> FeasibleSet:
-        """The sets {theta : A theta <= b}, with the gradients of their rows.
+    def from_halfspaces(
+        cls, halfspaces: Halfspaces | tuple[Tensor, Tensor], max_facets: int = MAX_FACETS
+    ) -> FeasibleSet:
+        """The sets {theta : A theta <= b}, given as `Halfspaces` or as a pair (A, b), with the gradients of their rows.
 
         Raises:
-            InputError: a set is not bounded, or a row is NaN or infinite.
+            InputError: they are neither, a set is not bounded, or a row is NaN or infinite.
         """
-        return cls.from_box(*given.box_around(halfspaces), max_facets).intersect(halfspaces)
+        rows = as_halfspaces(halfspaces)
+        return cls.from_box(*given.box_around(rows), max_facets).intersect(rows)
 
     @classmethod
     def from_vertices(cls, vertices: Float[Tensor, "*batch v 2"], max_facets: int = MAX_FACETS) -> FeasibleSet:

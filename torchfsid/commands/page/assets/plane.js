@@ -2,6 +2,11 @@
 
 const FONT = 'system-ui, -apple-system, "Segoe UI", Roboto, "Noto Sans", Arial, sans-serif';
 
+const TICKS = `11px ${FONT}`;
+
+/** Least room on the left of a plane [px]. */
+const LEFT = 46;
+
 /** A canvas in its size on the screen, cleared, in units of CSS pixels. */
 function prepared(canvas) {
   const ratio = window.devicePixelRatio || 1, box = canvas.getBoundingClientRect();
@@ -32,7 +37,7 @@ class Plane {
    *   paint(plane, pen): draws; follows: `fit` is called at every moment
    */
   constructor(parent, axes, names, options) {
-    Object.assign(this, { axes, names, options, moved: false, hits: [] });
+    Object.assign(this, { axes, names, options, moved: false, hits: [], left: LEFT });
     this.canvas = element("canvas", { role: "img", "aria-label": options.label });
     const zoom = (factor) => () => this.zoom(factor, this.width / 2, this.height / 2);
     const buttons = element("div", { className: "zoom" },
@@ -60,7 +65,6 @@ class Plane {
     return [this.left + (this.width - this.left) / 2 + (point[a] - x) * sx, (this.height - this.foot) / 2 - (point[b] - y) * sy];
   }
 
-  get left() { return 46; }
   get foot() { return 20; }
 
   zoom(factor, x, y) {
@@ -78,6 +82,8 @@ class Plane {
     if (!width || !height) return;
     Object.assign(this, { pen, width, height, hits: [] });
     if (!this.moved || !this.camera) this.fit();
+    this.makeRoom();
+    if (!this.moved) this.fit();
     this.grid();
     pen.save();
     pen.beginPath();
@@ -87,10 +93,18 @@ class Plane {
     pen.restore();
   }
 
+  /** Room on the left for the numbers of the vertical axis: far from the origin they are long. */
+  makeRoom() {
+    const { y, sy } = this.camera, h = (this.height - this.foot) / 2 / sy;
+    this.pen.font = TICKS;
+    const widths = ticks(y - h, y + h, (this.height - this.foot) / 72).map(([, text]) => this.pen.measureText(text).width);
+    this.left = Math.max(LEFT, Math.ceil(Math.max(0, ...widths)) + 10);
+  }
+
   grid() {
     const { pen, width, height, left, foot } = this, { x, y, sx, sy } = this.camera;
     const [w, h] = [(width - left) / 2 / sx, (height - foot) / 2 / sy], bottom = height - foot;
-    pen.font = `11px ${FONT}`;
+    pen.font = TICKS;
     pen.lineWidth = 1;
     pen.strokeStyle = paper("grid");
     pen.fillStyle = paper("muted");
