@@ -17,12 +17,14 @@ from torchfsid.observers.safety import SafetyObserver
 from torchfsid.outcome import Status
 from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.barriers import Arena, SpeedPolygon
+from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.neighbours import nearest_bodies
 from torchfsid.robots.simulation import simulate
 from torchfsid.robots.tasks import GoalTask, Saturation, UnknownGainGoalTask
 from torchfsid.robots.unknown_avoidance import UnknownAvoidance
+from torchfsid.sets.feasible_set import FeasibleSet
 
 PILLAR = torch.tensor([[0.3, 0.1]], dtype=torch.float64)
 UNEQUAL = torch.tensor([0.1, 0.2, 0.15, 0.25], dtype=torch.float64)
@@ -294,3 +296,21 @@ def test_what_is_refused() -> None:
         ObservationModel(team.task, [team.unknown], noise=team.noise)  # type: ignore[list-item]
     with pytest.raises(InputError, match="radii"):
         replace(team, unknown=UnknownAvoidance((0.1, 1.0), margin=(0.0, 0.1), distance="euclidean")).watched()
+
+
+def test_each_robot_has_a_bound_of_its_own() -> None:
+    """Robots that share nothing are read, and read again, as if each were alone."""
+    team, bounds = crossing(3, velocity=5e-3, unknown={"shared": "robot"}), torch.tensor([0.02, 0.005, 0.01]).double()
+    several = replace(team, noise=NoiseBound(bounds)).watched()
+    several.look_again(team.measurements)
+    for robot in range(3):
+        one = torch.tensor([robot])
+        half = torch.full((1, 2), 6.0, dtype=torch.float64)
+        alone = SafetyObserver(
+            team.task, [team.unknown], FeasibleSet.from_box(-half, half), NoiseBound(float(bounds[robot]))
+        )
+        for sample in team.measurements:
+            alone.update(sample.select(one))
+        alone.look_again([sample.select(one) for sample in team.measurements])
+        for found, expected in ((several.safety, alone.safety), (several.feasible_set, alone.feasible_set)):
+            torch.testing.assert_close(found.volume()[one], expected.volume(), rtol=1e-9, atol=0)

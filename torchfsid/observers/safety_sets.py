@@ -143,7 +143,8 @@ class SafetySets:
         """Look again at the robots `items`, who share the Psi at `place`."""
         before, t = self.possible, measurements[-1].time
         own = Possible(before.theta.select(items), before.psi.select(torch.tensor([place])), torch.zeros_like(items))
-        after = second_look(self.model, own, measurements, most)
+        model = replace(self.model, noise=self.model.noise.select(items))
+        after = second_look(model, own, measurements, most)
         mine = torch.isin(torch.arange(self.robots), items)
         if bool(after.is_empty.any()):
             against = contradicting(after.psi, 0) if after.psi.any_empty else ()
