@@ -15,7 +15,7 @@ from torch import Tensor
 import torchfsid as fsid
 from torchfsid.errors import BarrierError
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.identification import evidence
+from torchfsid.identification import compiled_evidence
 from torchfsid.robots.barriers import Barrier
 from torchfsid.robots.bounds import ErrorBounds, RowErrors
 from torchfsid.robots.orca import Orca
@@ -229,9 +229,9 @@ def test_robots_that_take_the_least_violation() -> None:
 
 def test_compiled_code_is_compared(monkeypatch: pytest.MonkeyPatch) -> None:
     check_compiled(AVOIDANCE, random_situations())
-    read = evidence._in_torch
+    read = compiled_evidence.read
     wider = lambda model, sample: read(model, replace(sample, bound=sample.bound + 0.1))  # noqa: E731
-    monkeypatch.setattr(evidence, "_compiled", wider)
+    monkeypatch.setattr(compiled_evidence, "read", wider)
     with pytest.raises(BarrierError, match="distances to the set differ in compiled code"):
         check_compiled(AVOIDANCE, random_situations())
 
