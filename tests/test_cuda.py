@@ -15,11 +15,11 @@ from torchfsid import device
 
 
 def test_on_the_simulator() -> None:
-    """All tests of `simulated_cuda.py`, in a process of their own."""
-    tests = Path(__file__).with_name("simulated_cuda.py")
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", str(tests)]
+    """All tests in `on_simulator`, in a process of their own."""
+    tests = sorted(map(str, Path(__file__).with_name("on_simulator").glob("[!_]*.py")))
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests]
     environment = {**os.environ, "NUMBA_ENABLE_CUDASIM": "1"}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=tests.parent.parent)
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=Path(__file__).parent.parent)
     assert done.returncode == 0, done.stdout + done.stderr
 
 

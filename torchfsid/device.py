@@ -26,7 +26,7 @@ INSTALL = "pip install 'torchfsid[cuda]', with numba-cuda[cu12] or [cu13] where 
 def missing() -> str:
     """Why there are no kernels for the device. It is empty if there are."""
     try:
-        kernels = import_module("torchfsid.kernels.cuda")
+        kernels = import_module("torchfsid.kernels.cuda.launch")
         kernels.probe()
     except (ImportError, AttributeError, RuntimeError) as error:
         return f"numba cannot use the device ({error}; {INSTALL})"
@@ -39,8 +39,16 @@ def has_kernels(*tensors: Tensor) -> bool:
 
 
 def launch(kernel: str, tensors: Sequence[Sequence[Tensor]], values: Sequence[Any], results: Any) -> None:
-    """Run a function of `kernels.cuda`, called with the tensors, the values and the results, which it fills."""
-    function: Callable = getattr(import_module("torchfsid.kernels.cuda"), kernel)
+    """Run a function of `kernels.cuda`, called with the tensors, the values and the results, which it fills.
+
+    Args:
+        kernel: the module and the name of the function, as in `planar.clip`.
+        tensors: what it reads.
+        values: what it takes as numbers.
+        results: what it fills.
+    """
+    module, name = kernel.split(".")
+    function: Callable = getattr(import_module(f"torchfsid.kernels.cuda.{module}"), name)
     given = [tuple(map(side_by_side, part)) for part in tensors]
     filled = [tuple(map(_array, part)) for part in results]
     if SIMULATED:

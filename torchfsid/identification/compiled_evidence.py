@@ -106,5 +106,5 @@ def _read_on_device(model: ObservationModel, sample: Sample) -> Read:
     matrices = ((B, 2, p), real), ((B, 2), real), ((B, 2, 2), real), ((B, 2, 2), real), ((B, 2), real)
     kkt = *matrices, ((B, m), boolean), *(((B,), long),) * 3
     results = [[device.empty(shape, u, dtype) for shape, dtype in part] for part in (half_spaces, judged, kkt)]
-    device.launch("evidence", given, (paper, model.active_tolerance, clip), results)
+    device.launch("planar.evidence", given, (paper, model.active_tolerance, clip), results)
     return Halfspaces(*results[0]), tuple(results[1]), KktSolution(*results[2])

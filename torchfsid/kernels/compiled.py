@@ -57,7 +57,7 @@ def launcher(function: Callable) -> Any:
 def folder() -> Path:
     """The folder with the compiled code of these sources, below NUMBA_CACHE_DIR or the user's cache folder."""
     package = Path(__file__).parent.parent
-    sources = [*sorted((package / "kernels").glob("*.py")), package / "tolerances.py", package / "outcome.py"]
+    sources = [*sorted((package / "kernels").rglob("*.py")), package / "tolerances.py", package / "outcome.py"]
     fingerprint = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:16]
     caches = os.environ.get("NUMBA_CACHE_DIR") or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return Path(caches) / "torchfsid" / fingerprint

@@ -167,7 +167,7 @@ class Polygon:
         )  # fmt: skip
         parts = *ring, *numbers, self.reach
         rows = A, b, time, source
-        device.launch("clip", (self.fields(), rows), (most, first > 0), (parts, found, lost))
+        device.launch("planar.clip", (self.fields(), rows), (most, first > 0), (parts, found, lost))
         body = Polygon(*parts, sheets=self.sheets)
         if first > 0:
             new = (body.label < 0).nonzero(as_tuple=True)

@@ -1,45 +1,24 @@
-"""Polygons and evidence on a GPU: the item functions of `polygon` and `evidence`, one thread an item.
-
-Arguments and results are arrays with `__cuda_array_interface__`, such as torch's tensors on the device; with numba's
-simulator (NUMBA_ENABLE_CUDASIM=1) numpy's arrays. Results are written to arrays that the caller has allocated. Threads
-of neighbouring items read and write at the same time, so that arrays whose first index has stride 1 are the fastest.
+"""Polygons and evidence in the plane on a GPU: the item functions of `polygon` and `evidence`, one thread an item.
 
 A kernel is compiled for each number of rows. An item's scratch lies in its thread's local memory.
 """
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
-import warnings
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import numpy as np
 from numba import boolean, cuda, float64, int64
 
 from torchfsid.kernels import evidence as reading
-from torchfsid.kernels.compiled import SIMULATED, item
+from torchfsid.kernels.compiled import item
+from torchfsid.kernels.cuda.launch import Arrays, launch
 from torchfsid.kernels.evidence import critical_region, inverse_optimal, read_one
 from torchfsid.kernels.polygon import EMPTY, copy_polygon, cut_one, keep_contradiction, keep_ring
 from torchfsid.kernels.saturation import BOUNDS, POINTS, ROWS, TOUCHING, clipped_inverse_optimal
 from torchfsid.tolerances import SPREAD
-
-THREADS = 64
-"""Threads in a block."""
-
-Arrays = Sequence[Any]
-
-
-def probe() -> None:
-    """Import what a first kernel needs.
-
-    Raises:
-        AttributeError: numba-cuda does not fit numpy (0.30 fails with numpy 2.5).
-    """
-    if importlib.util.find_spec("numba.cuda.np") is not None:  # numba's own CUDA target, without numba-cuda, has none
-        importlib.import_module("numba.cuda.np.arrayobj")
 
 
 def clip(given: Sequence[Arrays], values: tuple[int, bool], results: Sequence[Arrays], stream: int = 0) -> None:
@@ -56,7 +35,7 @@ def clip(given: Sequence[Arrays], values: tuple[int, bool], results: Sequence[Ar
         stream: the address of the stream to run on.
     """
     (B, R), slots = given[1][1].shape, max(given[0][2].shape[1], values[0])
-    _launch(_clip(R, slots + R + 1), B, given, (values[0], int(values[1])), results, stream)
+    launch(_clip(R, slots + R + 1), B, given, (values[0], int(values[1])), results, stream)
 
 
 def evidence(
@@ -81,28 +60,11 @@ def evidence(
     # Arrays in the place of those that are missing are not read.
     given = rows, sample, bounds, (angles[0] if angles else sample[2], corners[0] if corners else sample[0])
     first, second, by_norm, dead_speed = clip or (1.0, 1.0, False, 0.0)
-    _launch(kernel, B, given, (tolerance, first, second, dead_speed, int(by_norm)), results, stream)
+    launch(kernel, B, given, (tolerance, first, second, dead_speed, int(by_norm)), results, stream)
 
 
 def _around(paper: bool) -> np.ndarray:
     return reading.CRITICAL_DIRECTIONS if paper else reading.DIRECTIONS
-
-
-def _launch(
-    kernel: Any, count: int, given: Sequence[Arrays], values: tuple, results: Sequence[Arrays], stream: int
-) -> None:
-    if count == 0:
-        return
-    arrays = [tuple(map(_array, part)) for part in (*given, *results)]
-    queue = cuda.external_stream(stream) if stream else 0
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Grid size")  # few items leave most of a device idle: so be it
-        launcher = kernel[(count + THREADS - 1) // THREADS, THREADS, queue]
-    launcher(*arrays, values)
-
-
-def _array(array: Any) -> Any:
-    return array if SIMULATED else cuda.as_cuda_array(array, sync=False)
 
 
 @cache

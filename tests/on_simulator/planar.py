@@ -1,4 +1,4 @@
-"""Tests for a process with NUMBA_ENABLE_CUDASIM=1, see `test_cuda`: there, tensors stand for those on a device.
+"""Tests for a process with NUMBA_ENABLE_CUDASIM=1, see `tests.test_cuda`: there, tensors stand for those on a device.
 
 The simulator runs the kernels' Python source, and the other side is the same source compiled for the CPU. So the
 numbers are the same to the last bit, but for libm's functions of angles.
@@ -119,7 +119,7 @@ def test_a_ring_that_does_not_fit_stays_as_it_was() -> None:
         torch.ones(3, 3).long(),
     )
     rows = A, b, torch.zeros_like(b), torch.zeros_like(b).long()
-    device.launch("clip", (square.fields(), rows), (32, False), ((*parts, square.reach), found, lost))
+    device.launch("planar.clip", (square.fields(), rows), (32, False), ((*parts, square.reach), found, lost))
     assert found[1].tolist() == [False, True, False]
     assert parts[6].tolist() == [4, 4, 4]
     for part, before in zip(parts, square.fields()[:7], strict=True):
@@ -208,7 +208,7 @@ def test_the_observer_is_the_same(saturation: Saturation | None, launched: list[
         return watching, estimates
 
     (mine, ours), (other, theirs) = both(observed)
-    assert {"clip", "evidence"} <= set(launched)
+    assert {"planar.clip", "planar.evidence"} <= set(launched)
     for one, two in zip(ours, theirs, strict=True):
         same(one.status, two.status)
         same(one.informative, two.informative)

@@ -1,0 +1,51 @@
+"""How kernels are launched on a GPU: one thread an item.
+
+Arguments and results are arrays with `__cuda_array_interface__`, such as torch's tensors on the device; with numba's
+simulator (NUMBA_ENABLE_CUDASIM=1) numpy's arrays. Results are written to arrays that the caller has allocated. Threads
+of neighbouring items read and write at the same time, so that arrays whose first index has stride 1 are the fastest.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+from numba import cuda
+
+from torchfsid.kernels.compiled import SIMULATED
+
+THREADS = 64
+"""Threads in a block."""
+
+Arrays = Sequence[Any]
+
+
+def probe() -> None:
+    """Import what a first kernel needs.
+
+    Raises:
+        AttributeError: numba-cuda does not fit numpy (0.30 fails with numpy 2.5).
+    """
+    if importlib.util.find_spec("numba.cuda.np") is not None:  # numba's own CUDA target, without numba-cuda, has none
+        importlib.import_module("numba.cuda.np.arrayobj")
+
+
+def launch(
+    kernel: Any, count: int, given: Sequence[Arrays], values: tuple, results: Sequence[Arrays], stream: int
+) -> None:
+    """Run a kernel for `count` items on the stream with this address, or on the default stream if it is 0."""
+    if count == 0:
+        return
+    arrays = [tuple(map(_array, part)) for part in (*given, *results)]
+    queue = cuda.external_stream(stream) if stream else 0
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Grid size")  # few items leave most of a device idle: so be it
+        launcher = kernel[(count + THREADS - 1) // THREADS, THREADS, queue]
+    launcher(*arrays, values)
+
+
+def _array(array: Any) -> Any:
+    return array if SIMULATED else cuda.as_cuda_array(array, sync=False)
