@@ -227,9 +227,9 @@ class Probing:
             steps: number of samples. Default: the whole run.
         """
         scene, runs = self.to(goals.device), self.run(placements, goals, steps)
-        (B, T), seen = runs.feasible.shape, runs.measurement()
+        (B, T), seen, prior = runs.feasible.shape, runs.measurement(), scene.prior_of(1)
         with torch.no_grad():
-            found = evidence(self.model, scene.prior_of(1), seen)
+            found = evidence(self.model, prior, seen)
             omega, R = found.omega, found.omega.rows
             parts = (part.unflatten(0, (B, T)).flatten(1, 2) for part in (omega.A, omega.b))
             theta = scene.prior_of(B).intersect(Halfspaces(*parts))
@@ -247,7 +247,7 @@ class Probing:
             x, u = (part.flatten(0, 1).index_select(0, sample) for part in runs.along(path))
             probe = path.flatten(0, 1).index_select(0, sample // (T * len(goals)) * T + sample % T)
             bodies = torch.cat([again.bodies[:, :-1], probe.unsqueeze(1)], dim=1)
-            told = evidence(self.model, scene.prior_of(1), replace(again, x=x, u=u, bodies=bodies)).omega
+            told = evidence(self.model, prior, replace(again, x=x, u=u, bodies=bodies)).omega
             theta = carried(theta, (item, slot), told.select(of_facet))
         area = torch.where(sound, theta.volume(), self.prior_area)
         return Left(area.reshape(-1, len(goals)), sound.reshape(-1, len(goals)))
