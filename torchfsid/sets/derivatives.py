@@ -101,10 +101,10 @@ class _Measure(torch.autograd.Function):
         z = vertices(A, b, skeleton) if torch.is_grad_enabled() else skeleton.corners
         ends, normal = at(z, skeleton.simplices), at(A, skeleton.facet)
         area, ends = _over_length(ends, normal), ends - centroid[:, None, None]
-        total, grad_right, grad_row = added(ends, -2), 0.0, 0.0
+        total, grad_right, grad_row = added(ends, -2), torch.zeros_like(area), torch.zeros_like(normal)
         if grad_volume is not None:
-            push = area * grad_volume.unsqueeze(-1)
-            grad_right, grad_row = push, -(push / p).unsqueeze(-1) * total
+            grad_right = area * grad_volume.unsqueeze(-1)
+            grad_row = -(grad_right / p).unsqueeze(-1) * total
         if grad_centroid is not None:
             solid = skeleton.solid.unsqueeze(-1)
             pull = torch.where(solid, grad_centroid / torch.where(solid, volume.unsqueeze(-1), 1.0), 0.0)
