@@ -1,8 +1,7 @@
-"""Arrays of a GPU kernel from their addresses: whole numbers are handed to a kernel some twenty times faster than arrays.
+"""Arrays of a GPU kernel from their addresses: numbers are handed to a kernel some twenty times faster than arrays.
 
-An array is handed over as (address, extents ...). Its first index has stride 1, as in Fortran. A kernel turns it into an
-array again by `real`, `whole`, `short` or `truth`, which say the type of its entries. In numba's simulator arrays are
-handed over as they are.
+A kernel turns (address, extents ...) into an array by `real`, `whole`, `short` or `truth`, which say the type of its
+entries. Its first index has stride 1, as in Fortran. In numba's simulator the array itself stands for its address.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ def _of(dtype: Any) -> Callable:
 
 @item
 def _same(handed: Any) -> Any:
-    return handed
+    return handed[0]
 
 
 real, whole, short, truth = (

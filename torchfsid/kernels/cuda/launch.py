@@ -45,8 +45,8 @@ def launch(
 def launch_by_address(
     kernel: Any, count: int, given: Sequence[Arrays], values: tuple, results: Sequence[Arrays], stream: int
 ) -> None:
-    """`launch` a kernel that takes addresses of tensors. The first index of each has stride 1, as in Fortran."""
-    _start(kernel, count, [tuple(map(_handed, part)) for part in (*given, *results)], values, stream)
+    """`launch` a kernel that takes addresses of tensors, whose first index has stride 1, as in Fortran."""
+    _start(kernel, count, [tuple(map(_address, part)) for part in (*given, *results)], values, stream)
 
 
 def _start(kernel: Any, count: int, parts: Sequence[tuple], values: tuple, stream: int) -> None:
@@ -66,5 +66,5 @@ def _array(array: Any) -> Any:
     return array if SIMULATED else cuda.as_cuda_array(array, sync=False)
 
 
-def _handed(array: Any) -> Any:
-    return array if SIMULATED else (array.data_ptr(), *array.shape)
+def _address(array: Any) -> Any:
+    return array if SIMULATED else array.data_ptr()

@@ -48,10 +48,11 @@ def clip(given: Sequence[Arrays], values: tuple[int, bool], results: Sequence[Ar
             the first is zero.
         stream: the address of the stream to run on.
     """
-    (B, R), slots = given[1][1].shape, max(given[0][2].shape[1], values[0])
+    (B, R), V, most = given[1][1].shape, given[0][2].shape[1], values[0]
+    sizes = B, V, results[0][2].shape[1], *given[1][2].shape
     for listed in (False, True):
-        kernel = _clip(R, slots + R + 1, listed)
-        launch_by_address(kernel, B, given, (values[0], int(values[1])), results, stream)
+        kernel = _clip(R, max(V, most) + R + 1, listed)
+        launch_by_address(kernel, B, given, (most, int(values[1]), *sizes), results, stream)
 
 
 def evidence(
@@ -77,7 +78,8 @@ def evidence(
     # Arrays in the place of those that are missing are not read.
     given = rows, sample, bounds, (angles[0] if angles else sample[2], corners[0] if corners else sample[0])
     first, second, by_norm, dead_speed = clip or (1.0, 1.0, False, 0.0)
-    launch_by_address(kernel, B, given, (tolerance, first, second, dead_speed, int(by_norm)), results, stream)
+    values = tolerance, first, second, dead_speed, int(by_norm), B, *bounds[0].shape, *bounds[1].shape, *bounds[2].shape
+    launch_by_address(kernel, B, given, values, results, stream)
 
 
 def details(given: Sequence[Arrays], values: tuple[float], results: Sequence[Arrays], stream: int = 0) -> None:
@@ -89,22 +91,23 @@ def details(given: Sequence[Arrays], values: tuple[float], results: Sequence[Arr
         results: to be filled: (slack, excess), and the KKT conditions as in `KktSolution`.
         stream: the address of the stream to run on.
     """
-    B, m = given[0][1].shape
-    launch_by_address(_details(m), B, given, values, results, stream)
+    (B, m), p = given[0][1].shape, given[1][0].shape[2]
+    launch_by_address(_details(m, p), B, given, (*values, B, *given[2][0].shape), results, stream)
 
 
 @item
 @no_type_check
-def polygons_of(handed):
-    vertices, A, b, time, source, label, count, reach = handed
-    return real(vertices), real(A), real(b), real(time), whole(source), whole(label), whole(count), real(reach)
+def polygons_of(at, B, V):
+    return (
+        real((at[0], B, V, 2)), real((at[1], B, V, 2)), real((at[2], B, V)), real((at[3], B, V)),
+        whole((at[4], B, V)), whole((at[5], B, V)), whole((at[6], B)), real((at[7], B, 2)),
+    )  # fmt: skip
 
 
 @item
 @no_type_check
-def rows_of(handed):
-    A, b, time, source = handed
-    return real(A), real(b), real(time), whole(source)
+def rows_of(at, B, R, times, stamps):
+    return real((at[0], B, R, 2)), real((at[1], B, R)), real((at[2], times, stamps)), whole((at[3], B, R))
 
 
 @cache
@@ -113,11 +116,13 @@ def _clip(R: int, W: int, listed: bool) -> Callable:
 
     @no_type_check
     def clip_kernel(polygons, rows, result, found, lost, late, values):
-        i = cuda.grid(1)
-        polygons, rows, result, lost = polygons_of(polygons), rows_of(rows), polygons_of(result), rows_of(lost)
-        (A, b), late, outcome, shrunk = rows[:2], short(late[0]), whole(found[0]), truth(found[1])
-        if i >= (late[0] if listed else b.shape[0]):
+        i, (most, marks, B, V, slots, times, stamps) = cuda.grid(1), values
+        late, outcome, shrunk = short((late[0], B + 1)), whole((found[0], B)), truth((found[1], B))
+        if i >= (late[0] if listed else B):
             return
+        polygons, result = polygons_of(polygons, B, V), polygons_of(result, B, slots)
+        rows, lost = rows_of(rows, B, R, times, stamps), rows_of(lost, B, 3, B, 3)
+        A, b = rows[:2]
         k = int64(late[i + 1]) if listed else i
         ring, edge = cuda.local.array((1, W, 2), float64), cuda.local.array(W, int32)
         bound, tolerance = cuda.local.array(R, float64), cuda.local.array(R, float64)
@@ -130,8 +135,8 @@ def _clip(R: int, W: int, listed: bool) -> Callable:
             return
         state, smaller, row, before, after = OK, False, -1, -1, -1
         if cuts > 0:
-            n, state, smaller, row, before, after = cut_loaded(k, n, cuts, polygons, A, values[0], scratch)
-        smaller = smaller and n <= result[2].shape[1]
+            n, state, smaller, row, before, after = cut_loaded(k, n, cuts, polygons, A, most, scratch)
+        smaller = smaller and n <= slots
         outcome[k], shrunk[k] = state, smaller
         for j in range(3):
             lost[0][k, j, 0], lost[0][k, j, 1], lost[1][k, j] = np.nan, np.nan, np.nan
@@ -139,7 +144,7 @@ def _clip(R: int, W: int, listed: bool) -> Callable:
         if state == EMPTY:
             keep_contradiction(k, (row, before, after), polygons, rows, scratch, lost)
         if smaller or cuts == 0:
-            keep_ring(k, n, polygons, rows, scratch, values[1] != 0, result)
+            keep_ring(k, n, polygons, rows, scratch, marks != 0, result)
         else:
             copy_polygon(polygons, k, result)
 
@@ -160,40 +165,43 @@ def pad_rows(k, count, row_A, row_b, row_source):
 def _evidence(m: int, p: int, paper: bool, uncertain: bool, slots: int) -> Callable:
     """The kernel for m rows and p parameters, and for clipped nominal controls if sets have slots for vertices."""
     directions, clips = reading.CRITICAL_DIRECTIONS if paper else reading.DIRECTIONS, slots > 0
+    R = reading.rows_for(m, paper, clips)
     normals_of, generators = len(directions) + 1, m * len(SPREAD) if uncertain and not paper else m
     corners_of, of_rows, of_Q, touching, most = (slots, ROWS, BOUNDS, TOUCHING, POINTS) if clips else (1, 1, 1, 1, 1)
 
     @no_type_check
     def evidence_kernel(rows, sample, bounds, errors, half_spaces, judged, values):
-        k = cuda.grid(1)
-        rows = real(rows[0]), real(rows[1]), truth(rows[2]), truth(rows[3])
-        if k >= rows[1].shape[0]:
+        k, (tolerance, first, second, dead_speed, by_norm, B, items, entries, balls, drifts) = cuda.grid(1), values
+        if k >= B:
             return
+        rows = real((rows[0], B, m, 2)), real((rows[1], B, m)), truth((rows[2], m)), truth((rows[3], m))
         around = cuda.const.array_like(directions)
         unit, unit_b = cuda.local.array((m, 2), float64), cuda.local.array(m, float64)
         near, angle = cuda.local.array(m, boolean), cuda.local.array(generators, float64)
         order, generator = cuda.local.array(generators, int32), cuda.local.array(normals_of, int32)
         normals = cuda.local.array((normals_of, 2), float64)
         scratch = unit, unit_b, near, angle, order, normals, generator
-        C, d, u, usable = real(sample[0]), real(sample[1]), real(sample[2]), truth(sample[3])
-        bound, ball, drift = real(bounds[0]), real(bounds[1]), real(bounds[2])
-        angles = real(errors[0]) if uncertain else real(errors[0])[:, :0]
+        C, d, u = real((sample[0], B, 2, p)), real((sample[1], B, 2)), real((sample[2], B, 2))
+        usable = truth((sample[3], B))
+        bound, ball, drift = real((bounds[0], items, entries)), real((bounds[1], balls)), real((bounds[2], drifts))
+        angles = real((errors[0], B, m)) if uncertain else real((errors[0], B, m))[:, :0]
         fan = angles[:, :0] if paper else angles
         relaxed, relaxes = rows[3], False
         for j in range(m):
             relaxes = relaxes or relaxed[j]
-        informative, alarmed, infeasible = truth(judged[0]), truth(judged[1]), truth(judged[2])
+        informative, alarmed, infeasible = truth((judged[0], B)), truth((judged[1], B)), truth((judged[2], B))
         slack, excess = cuda.local.array((1, m), float64), cuda.local.array((1, m), float64)
         G, f = cuda.local.array((1, 2, p), float64), cuda.local.array((1, 2), float64)
         projector, free = cuda.local.array((1, 2, 2), float64), cuda.local.array((1, 2, 2), float64)
         offset, active = cuda.local.array((1, 2), float64), cuda.local.array((1, m), boolean)
         n_active, rank, case = cuda.local.array(1, int32), cuda.local.array(1, int32), cuda.local.array(1, int32)
         count = read_one(
-            k, 0, rows, (C, d, u, usable, bound), angles, fan, around, relaxes, paper, paper, values[0], scratch,
+            k, 0, rows, (C, d, u, usable, bound), angles, fan, around, relaxes, paper, paper, tolerance, scratch,
             (informative, alarmed, infeasible, slack, excess),
             (G, f, projector, free, offset, active, n_active, rank, case),
         )  # fmt: skip
-        row_A, row_b, row_source = real(half_spaces[0]), real(half_spaces[1]), whole(half_spaces[2])
+        row_A, row_b = real((half_spaces[0], B, R, p)), real((half_spaces[1], B, R))
+        row_source = whole((half_spaces[2], B, R))
         room, shift = ball[min(k, len(ball) - 1)], drift[min(k, len(drift) - 1)]
         if count >= 0 and paper:
             count = critical_region(
@@ -213,7 +221,7 @@ def _evidence(m: int, p: int, paper: bool, uncertain: bool, slots: int) -> Calla
                 cuda.local.array((most, 2), float64),
                 found,
             )
-            clip = (values[1], values[2]), values[4] != 0, values[3], real(errors[1])
+            clip = (first, second), by_norm != 0, dead_speed, real((errors[1], B, slots, 2))
             count = clipped_inverse_optimal(
                 k, m, u, room, shift, C, d, clip, normals, generator, count, len(order), work, row_A, row_b, row_source
             )
@@ -227,25 +235,23 @@ def _evidence(m: int, p: int, paper: bool, uncertain: bool, slots: int) -> Calla
 
 
 @cache
-def _details(m: int) -> Callable:
-    """The kernel for m rows."""
+def _details(m: int, p: int) -> Callable:
+    """The kernel for m rows and p parameters."""
 
     @no_type_check
     def details_kernel(rows, sample, bounds, slacks, kkt, values):
-        k = cuda.grid(1)
-        A, b, hard, relaxed = real(rows[0]), real(rows[1]), truth(rows[2]), truth(rows[3])
-        if k >= b.shape[0]:
+        k, (tolerance, B, items, entries) = cuda.grid(1), values
+        if k >= B:
             return
+        A, b, hard, relaxed = real((rows[0], B, m, 2)), real((rows[1], B, m)), truth((rows[2], m)), truth((rows[3], m))
+        C, d, u = real((sample[0], B, 2, p)), real((sample[1], B, 2)), real((sample[2], B, 2))
+        bound, slack, excess = real((bounds[0], items, entries)), real((slacks[0], B, m)), real((slacks[1], B, m))
+        G, f, offset = real((kkt[0], B, 2, p)), real((kkt[1], B, 2)), real((kkt[4], B, 2))
+        projector, free, active = real((kkt[2], B, 2, 2)), real((kkt[3], B, 2, 2)), truth((kkt[5], B, m))
+        solved = G, f, projector, free, offset, active, whole((kkt[6], B)), whole((kkt[7], B)), whole((kkt[8], B))
         unit, unit_b = cuda.local.array((m, 2), float64), cuda.local.array(m, float64)
         near = cuda.local.array(m, boolean)
-        C, d, u, bound = real(sample[0]), real(sample[1]), real(sample[2]), real(bounds[0])
-        G, f, projector, free = real(kkt[0]), real(kkt[1]), real(kkt[2]), real(kkt[3])
-        offset, active, n_active, rank, case = real(kkt[4]), truth(kkt[5]), whole(kkt[6]), whole(kkt[7]), whole(kkt[8])
-        judge(
-            k, k, A, b, hard, relaxed, u, bound, u[:, :0], values[0], unit, unit_b, real(slacks[0]), real(slacks[1]),
-            active, near,
-        )  # fmt: skip
-        solved = G, f, projector, free, offset, active, n_active, rank, case
+        judge(k, k, A, b, hard, relaxed, u, bound, u[:, :0], tolerance, unit, unit_b, slack, excess, active, near)
         solve_one(k, k, C, d, is_finite(k, C, d), unit, unit_b, solved)
 
     return cuda.jit(details_kernel)
