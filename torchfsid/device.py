@@ -11,7 +11,7 @@ Fortran.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, lru_cache
 from importlib import import_module
 from typing import Any
 
@@ -32,6 +32,26 @@ def missing() -> str:
     except (ImportError, AttributeError, RuntimeError) as error:
         return f"numba cannot use the device ({error}; {INSTALL})"
     return "" if kernels.cuda.is_available() else f"numba finds no driver or no compiler for the device ({INSTALL})"
+
+
+def on_host(*tensors: Tensor) -> bool:
+    """Are all tensors on the CPU, so that looking at their numbers waits for no device?"""
+    return not SIMULATED and all(tensor.is_cpu for tensor in tensors)
+
+
+def all_seen(mask: Tensor) -> bool:
+    """Is all of a mask true, as far as nothing has to wait for it? On a device the answer is False.
+
+    So it may choose a shorter way to the same result, and nothing else.
+    """
+    return on_host(mask) and bool(mask.all())
+
+
+@lru_cache(maxsize=256)
+def constant(values: tuple, where: torch.device, dtype: torch.dtype = torch.float64) -> Tensor:
+    """Numbers of the host as a tensor on a device, to which they are copied once. It must not be changed."""
+    with torch.inference_mode(False):
+        return torch.tensor(values, dtype=dtype, device=where)
 
 
 def has_kernels(*tensors: Tensor) -> bool:

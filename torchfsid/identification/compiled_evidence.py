@@ -47,7 +47,7 @@ def can_be_compiled(model: ObservationModel, sample: Sample, wanted: bool | None
         obstacle = "controls are neither in the plane nor in space"
     elif clipped and not sample.rows.dim == sample.C.shape[-1] == 2:
         obstacle = "the nominal control is clipped, and theta is not planar"
-    elif in_space and bool(sample.relaxed.any()):
+    elif in_space and model.relaxes:
         obstacle = "rows are relaxed, in space"
     elif torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
         obstacle = "gradients are required"

@@ -31,6 +31,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchfsid.device import all_seen, constant, on_host
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, dot, finite
 from torchfsid.identification import compiled_evidence
@@ -90,6 +91,11 @@ class ObservationModel:
             raise InputError("kind", "inverse_optimal, since some rows are not known exactly", self.kind)
         if not self.active_tolerance > 0:
             raise InputError("active_tolerance", "a positive number [units of the control]", self.active_tolerance)
+
+    @property
+    def relaxes(self) -> bool:
+        """Does the controller take the least violation of rows that are infeasible (`Barrier.relaxes`)?"""
+        return any(getattr(barrier, "relaxes", False) for barrier in self.barriers)
 
 
 @dataclass(frozen=True)
@@ -246,8 +252,8 @@ def sample_of(model: ObservationModel, theta: FeasibleSet, measurement: Measurem
     parts = [possible_rows(barrier, measurement, errors) for barrier in model.barriers]
     rows, (C, d) = Halfspaces.stack(parts), model.task(measurement)
     owners = [barrier for barrier, part in zip(model.barriers, parts, strict=True) for _ in range(part.rows)]
-    hard = torch.tensor([not barrier.soft for barrier in owners], dtype=torch.bool, device=u.device)
-    relaxed = torch.tensor([getattr(b, "relaxes", False) for b in owners], dtype=torch.bool, device=u.device)
+    hard = constant(tuple(not barrier.soft for barrier in owners), u.device, torch.bool)
+    relaxed = constant(tuple(getattr(barrier, "relaxes", False) for barrier in owners), u.device, torch.bool)
 
     bound, ball, drift = per_row(noise.slack, u), per_row(noise.velocity, u).squeeze(-1), u.new_zeros(())
     if measurement.velocity_error is not None:
@@ -267,7 +273,7 @@ def sample_of(model: ObservationModel, theta: FeasibleSet, measurement: Measurem
     if measurement.observed is not None:
         usable = usable & measurement.observed
     if measurement.left_out is not None:
-        error = u.new_tensor(2 * noise.position)
+        error = u.new_full((), 2 * noise.position)
         if measurement.position_error is not None:
             error = error + measurement.position_error
         usable = usable & left_out_inactive(model.barriers, within_bounds(measurement, noise), largest, error)
@@ -279,7 +285,7 @@ def sample_of(model: ObservationModel, theta: FeasibleSet, measurement: Measurem
         if errors is not None:
             ball = ball + model.task.feedback_error(errors)  # type: ignore[attr-defined]
 
-    turned = of_rows if of_rows is not None and bool((of_rows.angle > 0).any()) else None
+    turned = None if of_rows is None or all_seen(of_rows.angle == 0) else of_rows
     return Sample(
         rows, hard, relaxed, u, C.to(torch.float64), d.to(torch.float64), usable, bound, ball, drift, turned, corners,
     )  # fmt: skip
@@ -287,7 +293,7 @@ def sample_of(model: ObservationModel, theta: FeasibleSet, measurement: Measurem
 
 def _in_torch(model: ObservationModel, sample: Sample) -> Evidence:
     rows, C, d, usable, u = sample.rows, sample.C, sample.d, sample.usable, sample.u
-    if not finite(rows.A, rows.b, C, d):  # padding and zeros in place of what could not be evaluated
+    if not (on_host(u) and finite(rows.A, rows.b, C, d)):  # padding and zeros in place of what could not be evaluated
         are_known = rows.b.isfinite() & rows.A.isfinite().all(-1)
         wish_known = C.isfinite().all(-1).all(-1) & d.isfinite().all(-1)
         C, d = torch.where(wish_known[:, None, None], C, 0.0), torch.where(wish_known[:, None], d, 0.0)
@@ -298,7 +304,7 @@ def _in_torch(model: ObservationModel, sample: Sample) -> Evidence:
     excess, near = -slack - room, slack <= room
     alarmed, infeasible = usable & ((excess > 0) & sample.hard).any(-1), torch.zeros_like(usable)
     outward = None if model.kind == "critical_region" else normals_of(unit, near, sample.row_errors)
-    if outward is not None and bool(sample.relaxed.any()):
+    if outward is not None and model.relaxes:
         strained = ((excess > 0) & sample.relaxed).any(-1)
         alarmed = alarmed | usable & strained & (outward.opening > RELAXED_OPENING)
         infeasible = usable & ~alarmed & (strained | (outward.opening == 0))
