@@ -4,7 +4,8 @@ Kernels on a device need the extra `cuda`. With NUMBA_ENABLE_CUDASIM=1 they run 
 tensors on the CPU stand for those on a device: that is for tests.
 
 The first index of a batch counts items. A kernel's neighbouring threads handle neighbouring items, so tensors for
-kernels are laid out with neighbouring items side by side in memory (stride 1), and so are the results.
+kernels are laid out with neighbouring items side by side in memory (stride 1), and so are the results: as arrays are in
+Fortran.
 """
 
 from __future__ import annotations
@@ -46,6 +47,11 @@ def all_seen(mask: Tensor) -> bool:
     return on_host(mask) and bool(mask.all())
 
 
+def any_of(*masks: Tensor) -> list[bool]:
+    """For each mask, whether any of it is true. A device is waited for once."""
+    return [bool(mask.any()) for mask in masks] if on_host(*masks) else torch.stack([m.any() for m in masks]).tolist()
+
+
 @lru_cache(maxsize=256)
 def constant(values: tuple, where: torch.device, dtype: torch.dtype = torch.float64) -> Tensor:
     """Numbers of the host as a tensor on a device, to which they are copied once. It must not be changed."""
@@ -69,7 +75,7 @@ def launch(kernel: str, tensors: Sequence[Sequence[Tensor]], values: Sequence[An
     """
     module, name = kernel.split(".")
     function: Callable = getattr(import_module(f"torchfsid.kernels.cuda.{module}"), name)
-    given = [tuple(map(side_by_side, part)) for part in tensors]
+    given = [tuple(_array(side_by_side(tensor)) for tensor in part) for part in tensors]
     filled = [tuple(map(_array, part)) for part in results]
     if SIMULATED:
         function(given, values, filled)
@@ -81,13 +87,17 @@ def launch(kernel: str, tensors: Sequence[Sequence[Tensor]], values: Sequence[An
 
 def empty(shape: Sequence[int], like: Tensor, dtype: torch.dtype = torch.float64) -> Tensor:
     """A tensor on the device of another, with neighbouring items side by side. It is not filled."""
-    first, *others = shape
-    return torch.empty((*others, first), dtype=dtype, device=like.device).movedim(-1, 0)
+    return _reversed(torch.empty(tuple(shape)[::-1], dtype=dtype, device=like.device))
 
 
-def side_by_side(tensor: Tensor) -> Any:
-    """The numbers of a tensor as kernels take them. They are copied on the device unless neighbours are adjacent."""
-    return _array(tensor.detach().movedim(0, -1).contiguous().movedim(-1, 0))
+def side_by_side(tensor: Tensor) -> Tensor:
+    """The tensor as kernels take it. It is copied on the device unless neighbours are adjacent."""
+    return _reversed(_reversed(tensor.detach()).contiguous())
+
+
+def _reversed(tensor: Tensor) -> Tensor:
+    """The tensor with its dimensions in reverse order."""
+    return tensor if tensor.ndim < 2 else tensor.permute(*range(tensor.ndim)[::-1])
 
 
 def _array(tensor: Tensor) -> Any:

@@ -107,15 +107,17 @@ class ObservationModel:
 class Evidence:
     """What one measurement says by itself.
 
+    Slacks and KKT conditions are computed when they are first used. On a device this is done from the tensors of the
+    measurement, so that these must not be changed in place before.
+
     Attributes:
         omega: half-spaces of theta, all padding where the sample is not used. Their sources are those of
             `critical_region` or `inverse_optimal_set`.
         informative: whether the sample is used.
         alarmed: whether it is not used because a hard row is violated beyond its bound.
         infeasible: whether it is not used because the controller may have found its rows infeasible and relaxed them.
-        slack: the slack of every row at the measured control, in its units.
-        excess: the violation of every row beyond its bound, in these units; positive if it is violated.
         hard: the rows that no controller may violate.
+        slacks: computes `slack` and `excess`. Use these instead.
         solve: solves the KKT conditions. Use `kkt` instead.
         omega_without: the half-spaces of theta for k items if a row of each were inactive: called with (items, rows).
     """
@@ -124,11 +126,24 @@ class Evidence:
     informative: Bool[Tensor, "B"]
     alarmed: Bool[Tensor, "B"]
     infeasible: Bool[Tensor, "B"]
-    slack: Float[Tensor, "B m"]
-    excess: Float[Tensor, "B m"]
     hard: Bool[Tensor, "m"]
+    slacks: Callable[[], tuple[Tensor, Tensor]]
     solve: Callable[[], KktSolution]
     omega_without: Callable[[Int[Tensor, "k"], Int[Tensor, "k"]], Halfspaces]
+
+    @cached_property
+    def _measured(self) -> tuple[Tensor, Tensor]:
+        return self.slacks()
+
+    @property
+    def slack(self) -> Float[Tensor, "B m"]:
+        """The slack of every row at the measured control, in its units."""
+        return self._measured[0]
+
+    @property
+    def excess(self) -> Float[Tensor, "B m"]:
+        """The violation of every row beyond its bound, in its units; positive if it is violated."""
+        return self._measured[1]
 
     @cached_property
     def kkt(self) -> KktSolution:
@@ -140,8 +155,9 @@ class Evidence:
         source = None if self.omega.source is None else self.omega.source[items]
         return Evidence(
             Halfspaces(self.omega.A[items], self.omega.b[items], source), self.informative[items],
-            self.alarmed[items], self.infeasible[items], self.slack[items], self.excess[items], self.hard,
-            lambda: self.kkt.select(items), lambda chosen, rows: self.omega_without(items[chosen], rows),
+            self.alarmed[items], self.infeasible[items], self.hard,
+            lambda: (self.slack[items], self.excess[items]), lambda: self.kkt.select(items),
+            lambda chosen, rows: self.omega_without(items[chosen], rows),
         )  # fmt: skip
 
 
@@ -221,9 +237,9 @@ def read_sample(model: ObservationModel, sample: Sample, compiled: bool | None) 
     """`evidence` of a sample that is already evaluated."""
     if not compiled_evidence.can_be_compiled(model, sample, compiled):
         return _in_torch(model, sample)
-    omega, (informative, alarmed, infeasible, slack, excess), solved = compiled_evidence.read(model, sample)
+    omega, judged, details = compiled_evidence.read(model, sample)
     return Evidence(
-        omega, informative, alarmed, infeasible, slack, excess, sample.hard, lambda: solved, sample.omega_without(model)
+        omega, *judged, sample.hard, lambda: details()[:2], lambda: details()[2], sample.omega_without(model)
     )
 
 
@@ -311,5 +327,6 @@ def _in_torch(model: ObservationModel, sample: Sample) -> Evidence:
         )  # fmt: skip
     omega = omega.where(informative.unsqueeze(-1))
     return Evidence(
-        omega, informative, alarmed, infeasible, slack, excess, sample.hard, solve, sample.omega_without(model)
-    )
+        omega, informative, alarmed, infeasible, sample.hard, lambda: (slack, excess), solve,
+        sample.omega_without(model),
+    )  # fmt: skip
