@@ -19,8 +19,9 @@ from typing import no_type_check
 import numpy as np
 
 from torchfsid.kernels.compiled import item, launcher
-from torchfsid.kernels.evidence import CRITICAL_DIRECTIONS, find_generators, outward_normals, solve_active
+from torchfsid.kernels.evidence import CRITICAL_DIRECTIONS, find_generators, outward_normals
 from torchfsid.kernels.frame import scale_of
+from torchfsid.kernels.kkt import solve_active
 from torchfsid.tolerances import RANK_TOLERANCE
 
 FAN = len(CRITICAL_DIRECTIONS)
@@ -30,7 +31,7 @@ LEAST = RANK_TOLERANCE**2
 @item
 @no_type_check
 def to_unit(k, A, b, active, unit, unit_b, length, on):
-    """Fill the unit rows of item k, the lengths of the rows and the active rows. Zero rows stay, and are never active."""
+    """Fill the unit rows of item k, the lengths of the rows and the active rows. Zero rows are never active."""
     for j in range(len(unit_b)):
         scale = scale_of(A[k], j)
         p, q = A[k, j, 0] * scale, A[k, j, 1] * scale
@@ -176,7 +177,7 @@ def solve_vjp(on, unit, unit_b, offset, P, rank, of_x, of_y, of_P, of_unit, of_b
     """Add the derivatives of the active rows that pass through their offset and, at rank 1, through P."""
     if rank == 0:
         return
-    # M by the principal axes of the active rows, as in `evidence.solve_active`.
+    # M by the principal axes of the active rows, as in `kkt.solve_active`.
     one = two = three = yy = yz = ww = 0.0
     for j in range(len(unit_b)):
         if on[0, j]:
