@@ -26,9 +26,9 @@ from torch import Tensor
 
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, lengths
+from torchfsid.kernels.active_rows import simplex_around
 from torchfsid.outcome import Status
 from torchfsid.programmes import exact
-from torchfsid.programmes.exact import simplex_around
 
 
 class NearestPoint(NamedTuple):
