@@ -22,7 +22,8 @@ from torchfsid.kernels.threads import get_num_threads, set_num_threads
 from torchfsid.outcome import Status
 from torchfsid.programmes.layers import ChebyshevCentre, ProjectOnto
 
-ROWS, DIMENSIONS, SIZES, WARM, REPEATS = 24, (2, 3), (4096, 65_536), 2, 5
+ROWS, DIMENSIONS, SIZES = 24, (2, 3), (4096, 65_536)
+WARM, REPEATS = {"cuda": 2, "cpu": 1}, {"cuda": 9, "cpu": 3}
 TARGET_BATCH, TARGET = 65_536, 10e-3
 """Forward and backward of this batch take at most this long on an H100 [s]."""
 
@@ -64,13 +65,13 @@ def without_gradients(layer: Callable[..., Answer], given: list[Tensor]) -> Answ
 def timed(where: str, step: Callable[[], Answer]) -> tuple[float, Answer]:
     """The median time of a step [s], until the device has done it, and its result."""
     spent, found = [], ()
-    for _ in range(WARM + REPEATS):
+    for _ in range(WARM[where] + REPEATS[where]):
         began = time.perf_counter()
         found = step()
         if where == "cuda":
             torch.cuda.synchronize()
         spent.append(time.perf_counter() - began)
-    return median(spent[WARM:]), found
+    return median(spent[WARM[where] :]), found
 
 
 def one(layer: Callable[..., Answer], B: int, p: int, where: str) -> dict:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
+from benchmarks import cuda_layers
 from tests.hard_sets import hard_sets, padded
 from tests.on_simulator._both import SIZES, Waits, both, launched, same
 from torchfsid.halfspaces import Halfspaces
@@ -197,3 +198,12 @@ def test_no_sets() -> None:
 
     for mine, theirs in zip(*both(searched), strict=True):
         same(mine, theirs)
+
+
+def test_the_benchmark_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    runs = cuda_layers.compare((3,), "cpu")["runs"]
+    assert {(run["layer"], run["dimension"]) for run in runs} == {
+        (n, p) for n in ("projection", "chebyshev") for p in (2, 3)
+    }
+    assert all(run["largest_difference"] == run["largest_difference_of_gradients"] == 0 for run in runs)
+    assert capsys.readouterr().out.count("one core") == len(runs)

@@ -42,12 +42,13 @@ def contains(
 
 def inscribed(
     vertices: Float[Tensor, "B V 2"], A: Float[Tensor, "B V 2"], b: Float[Tensor, "B V"], count: Int[Tensor, "B"]
-) -> tuple[Tensor, ...]:
+) -> tuple[Float[Tensor, "B 2"], Float[Tensor, "B"], Int[Tensor, "B 3"], Bool[Tensor, "B"]]:
     """The largest discs of polygons: centre, radius, the rows that decide them, and whether they were found."""
     B, V = b.shape
     shapes = [((B, 2), REAL), ((B,), REAL), ((B, 3), INDEX), ((B,), MASK)]
     lines = [((B, V, 2), REAL), ((B, V), REAL)]
-    return _searched(disc.inscribed, (vertices, A, b, count), shapes, lines)
+    centre, radius, rows, found = _searched(disc.inscribed, (vertices, A, b, count), shapes, lines)
+    return centre, radius, rows, found
 
 
 def feet(
@@ -57,10 +58,11 @@ def feet(
     count: Int[Tensor, "B"],
     point: Float[Tensor, "B 2"],
     metric: Float[Tensor, "B 2 2"],
-) -> tuple[Tensor, ...]:
+) -> tuple[Float[Tensor, "B 2"], Int[Tensor, "B 2"]]:
     """The nearest points of polygons and their active rows, see `kernels.foot.feet`."""
     shapes = [((len(b), 2), REAL), ((len(b), 2), INDEX)]
-    return _searched(foot.feet, (vertices, A, b, count, point, metric), shapes)
+    nearest, active = _searched(foot.feet, (vertices, A, b, count, point, metric), shapes)
+    return nearest, active
 
 
 def _searched(
