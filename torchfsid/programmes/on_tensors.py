@@ -32,9 +32,12 @@ def on_items(of: Callable[..., tuple], A: Tensor, *others: Tensor) -> tuple[Tens
     arrays = (
         t.detach().cpu().contiguous().numpy().reshape((batch.numel(), *t.shape[len(batch) :])) for t in (A, *others)
     )
+    return tuple(torch.from_numpy(array.reshape((*batch, *array.shape[1:]))).to(where) for array in _quiet(of, *arrays))
+
+
+def _quiet(of: Callable[..., tuple], *arrays: np.ndarray) -> tuple:
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        found = of(*arrays)
-    return tuple(torch.from_numpy(array.reshape((*batch, *array.shape[1:]))).to(where) for array in found)
+        return of(*arrays)
 
 
 # On a device --------------------------------------------------------------------------------------------------------
@@ -81,7 +84,7 @@ def _verified(of: Callable, given: tuple[Tensor, ...], found: tuple[Tensor, ...]
     """The results, with the items that are UNSOLVED replaced by those of the same function of `exact`."""
     lost = (found[-1] == Status.UNSOLVED).nonzero().squeeze(-1)
     if len(lost) > 0:
-        again = of(*(tensor[lost].numpy(force=True) for tensor in given))
+        again = _quiet(of, *(tensor[lost].numpy(force=True) for tensor in given))
         for part, solved in zip(found, again, strict=True):
             part[lost] = torch.from_numpy(solved).to(part.device)
     return found
