@@ -181,8 +181,12 @@ def line_of(run: dict, bandwidth: float) -> str:
     if run["compiled"] and on_device:
         share = run["bytes"] / bandwidth / run["kernels_s"]
         line += f"; {run['bytes'] / robots:.0f} bytes each, {share:.1%} of a copy's speed\n{'':27s}host busy "
-        line += f"{run['kernels_host_s'] * 1e3:.3f} ms of read and clip, {run['update_host_s'] * 1e3:.3f} ms of an update"
-        line += f"; on the device read {run['read_on_device_s'] * 1e3:.3f} ms, clip {run['clip_on_device_s'] * 1e3:.3f} ms"
+        line += (
+            f"{run['kernels_host_s'] * 1e3:.3f} ms of read and clip, {run['update_host_s'] * 1e3:.3f} ms of an update"
+        )
+        line += (
+            f"; on the device read {run['read_on_device_s'] * 1e3:.3f} ms, clip {run['clip_on_device_s'] * 1e3:.3f} ms"
+        )
     return f"{line}; truths lost {run['truths_lost']}"
 
 
