@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from benchmarks.scenario import BARRIER, TASK, Fleet, measured
-from tests.on_simulator.planar import both, same
+from tests.on_simulator._both import both, same
 from tests.round_trips import RoundTrips
 from torchfsid import device
 from torchfsid.halfspaces import Halfspaces
