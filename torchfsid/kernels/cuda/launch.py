@@ -34,14 +34,15 @@ def probe() -> None:
     """
     if importlib.util.find_spec("numba.cuda.np") is None:  # numba's own CUDA target, without numba-cuda, has none
         return
-    lacks = not hasattr(np, "row_stack")
-    if lacks:  # numpy 2.5 has dropped this name of `vstack`. numba-cuda, up to 0.30.4, looks for it when it is imported
-        np.row_stack = np.vstack  # type: ignore[attr-defined]
+    dropped = "row_stack"  # numpy 2.5 has no such alias of `vstack`; numba-cuda, up to 0.30.4, imports it
+    lent = not hasattr(np, dropped)
+    if lent:
+        setattr(np, dropped, np.vstack)
     try:
         importlib.import_module("numba.cuda.np.arrayobj")
     finally:
-        if lacks:
-            del np.row_stack  # type: ignore[attr-defined]
+        if lent:
+            delattr(np, dropped)
 
 
 def launch(
