@@ -98,7 +98,9 @@ def empty(shape: Sequence[int], like: Tensor, dtype: torch.dtype = torch.float64
 
 def side_by_side(tensor: Tensor) -> Tensor:
     """The tensor as kernels take it. It is copied on the device unless neighbours are adjacent."""
-    return _reversed(_reversed(tensor.detach()).contiguous())
+    tensor = tensor.detach() if tensor.requires_grad else tensor
+    flipped = _reversed(tensor)
+    return tensor if flipped.is_contiguous() else _reversed(flipped.contiguous())
 
 
 def _reversed(tensor: Tensor) -> Tensor:
