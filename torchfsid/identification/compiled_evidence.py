@@ -14,7 +14,9 @@ from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, array
 from torchfsid.identification.kkt import KktSolution
 from torchfsid.kernels import evidence as kernel
-from torchfsid.kernels.evidence_in_space import evidence_in_space
+from torchfsid.kernels.cones import RING
+from torchfsid.kernels.evidence_in_space import evidence_in_space, places
+from torchfsid.kernels.evidence_in_space import rows_for as rows_in_space
 
 if TYPE_CHECKING:
     from torchfsid.identification.evidence import ObservationModel, Sample
@@ -57,14 +59,14 @@ def can_be_compiled(model: ObservationModel, sample: Sample, wanted: bool | None
 def _obstacle_on_device(tensors: Sequence[Tensor], rows: Halfspaces) -> str | None:
     if not all(tensor.is_cuda for tensor in tensors):
         return "tensors are neither all on the CPU nor all on CUDA"
-    if rows.dim == 3 or rows.rows == 0:
-        return f"tensors are on CUDA, and {'controls in space' if rows.dim == 3 else 'there are no rows'}"
+    if rows.rows == 0:
+        return "tensors are on CUDA, and there are no rows"
     return device.missing() or None
 
 
 def read(model: ObservationModel, sample: Sample) -> Read:
     """What the kernels say of a sample."""
-    if sample.rows.dim == 2 and sample.rows.rows > 0 and device.has_kernels(sample.rows.A, sample.u):
+    if sample.rows.rows > 0 and device.has_kernels(sample.rows.A, sample.u):
         return _read_on_device(model, sample)
     angles = sample.u[:, :0] if sample.row_errors is None else sample.row_errors.angle
     rows, relaxed = (sample.rows.A, sample.rows.b, sample.hard), (sample.relaxed,)
@@ -88,23 +90,29 @@ def read(model: ObservationModel, sample: Sample) -> Read:
 
 def _read_on_device(model: ObservationModel, sample: Sample) -> Read:
     paper, saturation, u = model.kind == "critical_region", model.task.saturation, sample.u
-    (B, m, _), p = sample.rows.A.shape, sample.C.shape[-1]
+    (B, m, n), p = sample.rows.A.shape, sample.C.shape[-1]
+    rows, in_space = (sample.rows.A, sample.rows.b, sample.hard), n == 3
+    angles = () if sample.row_errors is None else (sample.row_errors.angle,)
     given = (
-        (sample.rows.A, sample.rows.b, sample.hard, sample.relaxed),
+        rows if in_space else (*rows, sample.relaxed),
         (sample.C, sample.d, u, sample.usable),
         (torch.atleast_2d(sample.bound), torch.atleast_1d(sample.ball), torch.atleast_1d(sample.drift)),
-        () if sample.row_errors is None else (sample.row_errors.angle,),
-        () if saturation is None or sample.corners is None else (sample.corners,),
+        angles,
     )
     clip = None
     if saturation is not None:
         clip = *map(float, saturation.limits), saturation.shape == "norm", float(saturation.dead_speed)
-    R = kernel.rows_for(m, paper, clip is not None)
+    R = rows_in_space(m, paper) if in_space else kernel.rows_for(m, paper, clip is not None)
     real, boolean, long = torch.float64, torch.bool, torch.long
     half_spaces = (((B, R, p), real), ((B, R), real), ((B, R), long))
     judged = (((B,), boolean),) * 3 + (((B, m), real),) * 2
-    matrices = ((B, 2, p), real), ((B, 2), real), ((B, 2, 2), real), ((B, 2, 2), real), ((B, 2), real)
+    matrices = ((B, n, p), real), ((B, n), real), ((B, n, n), real), ((B, n, n), real), ((B, n), real)
     kkt = *matrices, ((B, m), boolean), *(((B,), long),) * 3
     results = [[device.empty(shape, u, dtype) for shape, dtype in part] for part in (half_spaces, judged, kkt)]
-    device.launch("planar.evidence", given, (paper, model.active_tolerance, clip), results)
+    if in_space:
+        work = device.scratch(places(m, m * RING if angles and not paper else m), B, u)
+        device.launch("space.evidence", given, (paper, model.active_tolerance), (*results, work))
+    else:
+        corners = () if saturation is None or sample.corners is None else (sample.corners,)
+        device.launch("planar.evidence", (*given, corners), (paper, model.active_tolerance, clip), results)
     return Halfspaces(*results[0]), tuple(results[1]), KktSolution(*results[2])
