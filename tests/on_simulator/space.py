@@ -9,12 +9,13 @@ import pytest
 import torch
 
 from tests import test_evidence_kernel as scenes_in_the_plane
+from tests import test_saturation_in_space as clipped
 from tests import test_sets_in_space as scenes
 from tests.on_simulator.planar import SIZES, both, launched, same, same_evidence
 from tests.scenes_in_space import DEPENDENT, random_scene, scene_of
 from torchfsid import device
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.identification.evidence import Evidence, SetKind
+from torchfsid.identification.evidence import Evidence, SetKind, evidence
 from torchfsid.observers.set_membership import SetMembershipObserver
 from torchfsid.outcome import Status
 from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
@@ -145,6 +146,12 @@ def same_in_space(one: Evidence, other: Evidence) -> None:
 @pytest.mark.parametrize("name", DEPENDENT)
 def test_dependent_rows_are_read_alike(name: str) -> None:
     same_in_space(*both(lambda: scenes.both("critical_region", [scene_of(name, np.random.default_rng(2))], False)[1]))
+
+
+@pytest.mark.parametrize("name", ["norm", "lazy box"])
+def test_clipped_controls_are_read_alike(name: str, launched: list[str]) -> None:
+    same_in_space(*both(lambda: evidence(*clipped.scene(name, errors=True, count=5), compiled=True)))
+    assert launched == ["space.evidence", "space.clip", "space.unclipped"]
 
 
 @pytest.mark.parametrize("task", [GoalTask(0.8, dimension=3), UnknownGainGoalTask()], ids=["in space", "unknown gain"])

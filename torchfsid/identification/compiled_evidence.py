@@ -12,11 +12,9 @@ from torch import Tensor
 from torchfsid import device
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, array
+from torchfsid.identification import compiled_in_space
 from torchfsid.identification.kkt import KktSolution
 from torchfsid.kernels import evidence as kernel
-from torchfsid.kernels.cones import RING
-from torchfsid.kernels.evidence_in_space import evidence_in_space, places
-from torchfsid.kernels.evidence_in_space import rows_for as rows_in_space
 
 if TYPE_CHECKING:
     from torchfsid.identification.evidence import ObservationModel, Sample
@@ -43,7 +41,7 @@ def can_be_compiled(model: ObservationModel, sample: Sample, wanted: bool | None
     obstacle, in_space, clipped = None, sample.rows.dim == 3, model.task.saturation is not None
     if sample.rows.dim not in (2, 3):
         obstacle = "controls are neither in the plane nor in space"
-    elif clipped and not sample.rows.dim == sample.C.shape[-1] == 2:
+    elif clipped and not in_space and sample.C.shape[-1] != 2:
         obstacle = "the nominal control is clipped, and theta is not planar"
     elif in_space and bool(sample.relaxed.any()):
         obstacle = "rows are relaxed, in space"
@@ -66,6 +64,8 @@ def _obstacle_on_device(tensors: Sequence[Tensor], rows: Halfspaces) -> str | No
 
 def read(model: ObservationModel, sample: Sample) -> Read:
     """What the kernels say of a sample."""
+    if sample.rows.dim == 3:
+        return compiled_in_space.read(model, sample)
     if sample.rows.rows > 0 and device.has_kernels(sample.rows.A, sample.u):
         return _read_on_device(model, sample)
     angles = sample.u[:, :0] if sample.row_errors is None else sample.row_errors.angle
@@ -75,14 +75,11 @@ def read(model: ObservationModel, sample: Sample) -> Read:
         torch.atleast_2d(sample.bound), angles, torch.atleast_1d(sample.ball), torch.atleast_1d(sample.drift),
     )  # fmt: skip
     saturation, paper, clip = model.task.saturation, model.kind == "critical_region", NO_CLIP
-    if sample.rows.dim == 3:
-        found = evidence_in_space(*map(array, rows + others), paper, model.active_tolerance)
-    else:
-        if saturation is not None:
-            assert sample.corners is not None
-            limits = np.array(saturation.limits, dtype=np.float64)
-            clip = limits, saturation.shape == "norm", float(saturation.dead_speed), array(sample.corners)
-        found = kernel.evidence(*map(array, rows + relaxed + others), clip, paper, model.active_tolerance)
+    if saturation is not None:
+        assert sample.corners is not None
+        limits = np.array(saturation.limits, dtype=np.float64)
+        clip = limits, saturation.shape == "norm", float(saturation.dead_speed), array(sample.corners)
+    found = kernel.evidence(*map(array, rows + relaxed + others), clip, paper, model.active_tolerance)
     half_spaces, judged, kkt = found
     solved = KktSolution(*map(torch.from_numpy, kkt))
     return Halfspaces(*map(torch.from_numpy, half_spaces)), tuple(map(torch.from_numpy, judged)), solved
@@ -90,29 +87,23 @@ def read(model: ObservationModel, sample: Sample) -> Read:
 
 def _read_on_device(model: ObservationModel, sample: Sample) -> Read:
     paper, saturation, u = model.kind == "critical_region", model.task.saturation, sample.u
-    (B, m, n), p = sample.rows.A.shape, sample.C.shape[-1]
-    rows, in_space = (sample.rows.A, sample.rows.b, sample.hard), n == 3
-    angles = () if sample.row_errors is None else (sample.row_errors.angle,)
+    (B, m, _), p = sample.rows.A.shape, sample.C.shape[-1]
     given = (
-        rows if in_space else (*rows, sample.relaxed),
+        (sample.rows.A, sample.rows.b, sample.hard, sample.relaxed),
         (sample.C, sample.d, u, sample.usable),
         (torch.atleast_2d(sample.bound), torch.atleast_1d(sample.ball), torch.atleast_1d(sample.drift)),
-        angles,
+        () if sample.row_errors is None else (sample.row_errors.angle,),
+        () if saturation is None or sample.corners is None else (sample.corners,),
     )
     clip = None
     if saturation is not None:
         clip = *map(float, saturation.limits), saturation.shape == "norm", float(saturation.dead_speed)
-    R = rows_in_space(m, paper) if in_space else kernel.rows_for(m, paper, clip is not None)
+    R = kernel.rows_for(m, paper, clip is not None)
     real, boolean, long = torch.float64, torch.bool, torch.long
     half_spaces = (((B, R, p), real), ((B, R), real), ((B, R), long))
     judged = (((B,), boolean),) * 3 + (((B, m), real),) * 2
-    matrices = ((B, n, p), real), ((B, n), real), ((B, n, n), real), ((B, n, n), real), ((B, n), real)
+    matrices = ((B, 2, p), real), ((B, 2), real), ((B, 2, 2), real), ((B, 2, 2), real), ((B, 2), real)
     kkt = *matrices, ((B, m), boolean), *(((B,), long),) * 3
     results = [[device.empty(shape, u, dtype) for shape, dtype in part] for part in (half_spaces, judged, kkt)]
-    if in_space:
-        work = device.scratch(places(m, m * RING if angles and not paper else m), B, u)
-        device.launch("space.evidence", given, (paper, model.active_tolerance), (*results, work))
-    else:
-        corners = () if saturation is None or sample.corners is None else (sample.corners,)
-        device.launch("planar.evidence", (*given, corners), (paper, model.active_tolerance, clip), results)
+    device.launch("planar.evidence", given, (paper, model.active_tolerance, clip), results)
     return Halfspaces(*results[0]), tuple(results[1]), KktSolution(*results[2])

@@ -15,15 +15,12 @@ from numba import cuda, float64, int64
 
 from torchfsid.kernels import evidence_in_space as reading
 from torchfsid.kernels.compiled import item
-from torchfsid.kernels.cones import EDGES, FAN
 from torchfsid.kernels.cuda.launch import Arrays, launch
 from torchfsid.kernels.polyhedron import EMPTY, cut_one, keep, keep_contradiction, merge_one
+from torchfsid.kernels.saturation_in_space import NORMALS, unclipped_one
 from torchfsid.kernels.scratch import entry
 from torchfsid.kernels.simple_polyhedron import copy
 from torchfsid.kernels.solid import extreme_of, measure_one, skeleton_one
-
-NORMALS = len(FAN) + EDGES
-"""The largest number of normals of a cone."""
 
 NO_VALUES = (0,)
 """The values of a kernel that needs none: no argument of a kernel is empty."""
@@ -80,6 +77,23 @@ def evidence(given: Sequence[Arrays], values: tuple[bool, float], results: Seque
     given = rows, sample, bounds, angles or sample[2:3]  # an array in the place of one that is missing is not read
     flags = int(values[0]), int(len(angles) > 0)
     launch(_evidence, len(results[-1][0]), given, (*flags, values[1]), results, stream)
+
+
+def unclipped(
+    given: Sequence[Arrays], values: tuple[int, bool, float], results: Sequence[Arrays], stream: int = 0
+) -> None:
+    """The half-spaces of theta for clipped nominal controls, see `saturation_in_space.unclipped_in_space`.
+
+    Args:
+        given: Q (A, b, source), the cut (points, count, outcome, limits), the nominal controls (C, d, wishes, margin),
+            and (informative,).
+        values: the source of rows that repeat none of Q, whether controls are clipped by norm, and the dead speed.
+        results: the half-spaces, to be filled. There are `saturation_in_space.rows_for`. Then the arrays `work`, see
+            `saturation_in_space.places`.
+        stream: the address of the stream to run on.
+    """
+    no_row, by_norm, dead_speed = values
+    launch(_unclipped, len(results[-1][0]), given, (no_row, int(by_norm), dead_speed), results, stream)
 
 
 @cuda.jit
@@ -191,6 +205,24 @@ def _evidence(rows, sample, bounds, errors, half_spaces, judged, kkt, work, valu
     for k in range(t, rows[1].shape[0], threads):
         pad_one(k, half_spaces, kkt)
         reading.read_one(k, rows, sample, bounds, angles, values[0] != 0, values[2], scratch, half_spaces, judged, kkt)
+
+
+@cuda.jit
+@no_type_check
+def _unclipped(admissible, cut, nominal, informative, rows, work, values):
+    t, threads = cuda.grid(1), work[0].shape[0]
+    if t >= threads:
+        return
+    (A, b, source), (no_row, by_norm, dead_speed) = admissible, values
+    row_A, row_b, row_source = rows
+    scratch = work[0][t], work[1][t], cuda.local.array((NORMALS, 3), float64), cuda.local.array(NORMALS, int64)
+    for k in range(t, b.shape[0], threads):
+        for n in range(row_b.shape[1]):
+            row_b[k, n], row_source[k, n] = 1.0, -1
+            for e in range(row_A.shape[2]):
+                row_A[k, n, e] = 0.0
+        if informative[0][k]:
+            unclipped_one(k, (A, b, source, no_row), cut, nominal, (by_norm != 0, dead_speed), scratch, rows)
 
 
 @item
