@@ -118,8 +118,8 @@ def test_a_ring_that_does_not_fit_stays_as_it_was() -> None:
         torch.empty(3, 3).double(),
         torch.ones(3, 3).long(),
     )
-    rows = A, b, torch.zeros_like(b), torch.zeros_like(b).long()
-    device.launch("planar.clip", (square.fields(), rows), (32, False), ((*parts, square.reach), found, lost))
+    rows, late = (A, b, torch.zeros_like(b), torch.zeros_like(b).long()), torch.zeros(4, dtype=torch.int32)
+    device.launch("planar.clip", (square.fields(), rows), (32, False), ((*parts, square.reach), found, lost, (late,)))
     assert found[1].tolist() == [False, True, False]
     assert parts[6].tolist() == [4, 4, 4]
     for part, before in zip(parts, square.fields()[:7], strict=True):

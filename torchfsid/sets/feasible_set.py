@@ -166,7 +166,7 @@ class FeasibleSet:
         rows = (
             self._flat(halfspaces.A, (m, p)),
             self._flat(halfspaces.b, (m,)),
-            self._flat(stamp, (m,)).contiguous(),
+            self._flat(stamp, (m,)),
             self._flat(source, (m,)),
         )
         clipped = self.body.clip(*rows, self.max_facets)

@@ -138,6 +138,7 @@ class Polygon:
         most: int,
     ) -> Clipped:
         """See `Body.clip`. An edge with parallel neighbours, as in a parallelogram, is never merged."""
+        time = once(time)
         differentiable = torch.is_grad_enabled() and (A.requires_grad or b.requires_grad)
         first = 1 + self.sheets.rows if differentiable else 0
         if b.shape[1] > 0 and device.has_kernels(A, b, self.b):
@@ -165,9 +166,9 @@ class Polygon:
         lost = (
             device.empty((B, 3, 2), b), device.empty((B, 3), b), device.empty((B, 3), b), device.empty((B, 3), b, ints),
         )  # fmt: skip
-        parts = *ring, *numbers, self.reach
-        rows = A, b, time, source
-        device.launch("planar.clip", (self.fields(), rows), (most, first > 0), (parts, found, lost))
+        late = torch.zeros(B + 1, dtype=torch.int32, device=b.device)
+        parts, rows = (*ring, *numbers, self.reach), (A, b, time, source)
+        device.launch("planar.clip", (self.fields(), rows), (most, first > 0), (parts, found, lost, (late,)))
         body = Polygon(*parts, sheets=self.sheets)
         if first > 0:
             new = (body.label < 0).nonzero(as_tuple=True)
@@ -306,6 +307,13 @@ def independent(v: Float[Tensor, "*B 2"], w: Float[Tensor, "*B 2"]) -> Bool[Tens
     return cross(v, w).abs() > PARALLEL_EDGES * torch.linalg.vector_norm(v, dim=-1) * torch.linalg.vector_norm(
         w, dim=-1
     )
+
+
+def once(tensor: Tensor) -> Tensor:
+    """The tensor with one entry along each dimension along which it was expanded."""
+    for dim, stride in enumerate(tensor.stride()):
+        tensor = tensor.narrow(dim, 0, 1) if stride == 0 and tensor.shape[dim] > 1 else tensor
+    return tensor
 
 
 def cross(v: Tensor, w: Tensor) -> Tensor:

@@ -8,14 +8,15 @@ proportional to the number of facets.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchfsid.halfspaces import array
+from torchfsid.halfspaces import Halfspaces, array
 
 
 @dataclass(frozen=True)
@@ -82,3 +83,24 @@ class Sheets:
         of_A, of_b = (part.index_select(0, label.flatten()).unflatten(0, label.shape) for part in (of_A, of_b))
         # Zeros with gradients are added. So a facet that was moved outward keeps its moved b.
         return A + (of_A - of_A.detach()), b + (of_b - of_b.detach())
+
+
+def carried(sets: Any, facets: tuple[Int[Tensor, "N"], Int[Tensor, "N"]], rows: Halfspaces) -> Any:
+    """A batch (B,) of sets without gradients, some of whose facets carry the gradients of the rows they came from.
+
+    So rows that were found without gradients are computed again with gradients only where they have become facets.
+
+    Args:
+        sets: the sets.
+        facets: these facets, as item and slot.
+        rows: batch (N,): for each of them several rows, one of which is its own in numbers.
+    """
+    body = sets.body
+    with torch.no_grad():
+        apart = (rows.A - body.A[facets].unsqueeze(1)).square().sum(-1) + (
+            rows.b - body.b[facets].unsqueeze(1)
+        ).square()
+        own = torch.arange(len(apart), device=apart.device), apart.argmin(-1)
+    label = torch.zeros_like(body.label)
+    label[facets] = own[0] + 1
+    return replace(sets, body=replace(body, label=label, sheets=Sheets().with_sheet(rows.A[own], rows.b[own])))

@@ -1,0 +1,100 @@
+"""What the host waits for, for a process with NUMBA_ENABLE_CUDASIM=1: code takes the ways that it takes on a device."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import islice
+
+import pytest
+import torch
+
+from benchmarks.scenario import BARRIER, TASK, Fleet, measured
+from tests.on_simulator.planar import both, same
+from tests.round_trips import RoundTrips
+from torchfsid import device
+from torchfsid.halfspaces import Halfspaces
+from torchfsid.identification.evidence import ObservationModel, Sample, sample_of
+from torchfsid.observers.set_membership import SetMembershipObserver
+from torchfsid.robots.barriers import Arena, Barrier, SpeedBox
+from torchfsid.robots.bounds import NoiseBound
+from torchfsid.robots.controller import CbfQpController
+from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.tasks import Saturation
+
+ROBOTS = 30
+WALLS = Arena((-9.0, -9.0), (9.0, 9.0), BARRIER.class_k)
+EXACT, ERRORS = NoiseBound(5e-3), NoiseBound(5e-3, position=1e-3, neighbour_velocity=1e-3)
+
+
+@pytest.fixture
+def measurement() -> Measurement:
+    *_, last = islice(Fleet(ROBOTS, noisy=True), 3)
+    return measured(*last)
+
+
+@pytest.fixture
+def counted(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Callable], RoundTrips]]:
+    """The round trips of a function, of which each kernel is one launch."""
+    counting, real = RoundTrips(), device.launch
+
+    def launch(*arguments: object) -> None:
+        before = counting.operations, counting.waits.copy()
+        real(*arguments)  # type: ignore[arg-type]
+        counting.operations, counting.waits = before[0] + 1, before[1]
+
+    def count(function: Callable) -> RoundTrips:
+        with counting:
+            function()
+        return counting
+
+    monkeypatch.setattr(device, "launch", launch)
+    yield count
+
+
+@pytest.mark.parametrize("barriers", [[BARRIER], [BARRIER, SpeedBox((2.0, 2.0)), WALLS]])
+@pytest.mark.parametrize("noise", [EXACT, ERRORS])
+def test_the_model_at_a_measurement_waits_for_nothing(
+    barriers: list[Barrier], noise: NoiseBound, measurement: Measurement, counted: Callable
+) -> None:
+    prior = Fleet(ROBOTS).prior()
+    model = ObservationModel(replace(TASK, saturation=Saturation("norm", (3.0, 3.0))), barriers, noise=noise)
+    sample_of(model, prior, measurement)  # constants are copied to the device once
+    found = counted(lambda: sample_of(model, prior, measurement))
+    assert not found.waits
+    if noise is EXACT:
+        assert found.operations <= 60 + 10 * len(barriers)
+
+
+def test_an_update_waits_seldom(measurement: Measurement, counted: Callable) -> None:
+    observer = SetMembershipObserver(TASK, [BARRIER], Fleet(ROBOTS).prior(), noise=EXACT)
+    observer.update(measurement)
+    found = counted(lambda: observer.update(measurement))
+    assert sum(found.waits.values()) <= 10
+    assert found.operations <= 100
+
+
+def test_a_controller_waits_for_its_programme_only(measurement: Measurement, counted: Callable) -> None:
+    controller, seen = CbfQpController(TASK, [BARRIER, WALLS]), replace(measurement, u=None)
+    controller(seen, Fleet(ROBOTS).goals)
+    found = counted(lambda: controller(seen, Fleet(ROBOTS).goals))
+    assert {file for file, _, _ in found.waits} <= {"differentiable.py", "exact.py"}
+
+
+@pytest.mark.parametrize("noise", [EXACT, ERRORS])
+def test_ways_without_waiting_lead_to_the_same_model(noise: NoiseBound, measurement: Measurement) -> None:
+    """Robots of which some stand still, all with slots for bodies that are not there."""
+    u, absent = measurement.u, torch.arange(ROBOTS) % 3 == 0
+    assert u is not None
+    present = measurement.present & ~(absent.unsqueeze(-1) & (torch.arange(8) > 4))
+    seen = replace(measurement, u=torch.where(absent.unsqueeze(-1), 0.0, u), present=present)
+    model = ObservationModel(TASK, [BARRIER, WALLS], noise=noise)
+    one, other = both(lambda: sample_of(model, Fleet(ROBOTS).prior(), seen))
+    for mine, theirs in zip(numbers_of(one), numbers_of(other), strict=True):
+        same(mine, theirs)
+
+
+def numbers_of(sample: Sample) -> list[torch.Tensor]:
+    errors = () if sample.row_errors is None else sample.row_errors
+    rows: Halfspaces = sample.rows
+    return [rows.A, rows.b, sample.u, sample.C, sample.d, sample.usable, sample.bound, sample.ball, *errors]
