@@ -11,7 +11,8 @@ import torch
 from tests import test_evidence_kernel as scenes_in_the_plane
 from tests import test_saturation_in_space as clipped
 from tests import test_sets_in_space as scenes
-from tests.on_simulator.planar import SIZES, both, launched, same, same_evidence
+from tests.on_simulator._both import SIZES, both, launched, same
+from tests.on_simulator.planar import same_evidence
 from tests.scenes_in_space import DEPENDENT, random_scene, scene_of
 from torchfsid import device
 from torchfsid.halfspaces import Halfspaces

@@ -69,7 +69,8 @@ def _obstacle_on_device(tensors: Sequence[Tensor], rows: Halfspaces) -> str | No
 def read(model: ObservationModel, sample: Sample) -> Read:
     """What the kernels say of a sample."""
     if sample.rows.dim == 3:
-        return compiled_in_space.read(model, sample)
+        omega, (informative, alarmed, infeasible, slack, excess), kkt = compiled_in_space.read(model, sample)
+        return omega, (informative, alarmed, infeasible), lambda: (slack, excess, kkt)
     if sample.rows.rows > 0 and device.has_kernels(sample.rows.A, sample.u):
         return _read_on_device(model, sample)
     angles = sample.u[:, :0] if sample.row_errors is None else sample.row_errors.angle

@@ -7,7 +7,7 @@ the box of the limits, and the half-spaces of the unclipped control.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 REAL, BOOL, LONG = torch.float64, torch.bool, torch.long
 
-Read = tuple[Halfspaces, Any, KktSolution]
-"""As in `compiled_evidence`."""
+Read = tuple[Halfspaces, tuple[Tensor, ...], KktSolution]
+"""The half-spaces, the fields of `Evidence` from `informative` to `excess`, and the KKT conditions."""
 
 
 def read(model: ObservationModel, sample: Sample) -> Read:
