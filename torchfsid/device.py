@@ -52,6 +52,11 @@ def all_seen(mask: Tensor) -> bool:
     return on_host(mask) and bool(mask.all())
 
 
+def any_of(*masks: Tensor) -> list[bool]:
+    """For each mask, whether any of it is true. A device is waited for once."""
+    return [bool(mask.any()) for mask in masks] if on_host(*masks) else torch.stack([m.any() for m in masks]).tolist()
+
+
 @lru_cache(maxsize=256)
 def constant(values: tuple, where: torch.device, dtype: torch.dtype = torch.float64) -> Tensor:
     """Numbers of the host as a tensor on a device, to which they are copied once. It must not be changed."""

@@ -116,12 +116,9 @@ def _read_on_device(model: ObservationModel, sample: Sample) -> Read:
 def _details_on_device(tolerance: float, sample: Sample) -> tuple[Tensor, Tensor, KktSolution]:
     (B, m, _), p, u, long = sample.rows.A.shape, sample.C.shape[-1], sample.u, torch.long
     slack, excess = device.empty((B, m), u), device.empty((B, m), u)
-    solved = KktSolution(
-        *(device.empty(shape, u) for shape in ((B, 2, p), (B, 2), (B, 2, 2), (B, 2, 2), (B, 2))),
-        device.empty((B, m), u, torch.bool),
-        *(device.empty((B,), u, long) for _ in range(3)),
-    )
+    matrices = [device.empty(shape, u) for shape in ((B, 2, p), (B, 2), (B, 2, 2), (B, 2, 2), (B, 2))]
+    solved = *matrices, device.empty((B, m), u, torch.bool), *(device.empty((B,), u, long) for _ in range(3))
     rows = sample.rows.A, sample.rows.b, sample.hard, sample.relaxed
     given = rows, (sample.C, sample.d, u), (torch.atleast_2d(sample.bound),)
-    device.launch("planar.details", given, (tolerance,), ((slack, excess), vars(solved).values()))
-    return slack, excess, solved
+    device.launch("planar.details", given, (tolerance,), ((slack, excess), solved))
+    return slack, excess, KktSolution(*solved)

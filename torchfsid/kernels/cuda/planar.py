@@ -24,8 +24,15 @@ from torchfsid.kernels.cuda.launch import Arrays, launch_by_address
 from torchfsid.kernels.evidence import critical_region, inverse_optimal, is_finite, judge, read_one
 from torchfsid.kernels.kkt import solve_one
 from torchfsid.kernels.polygon import (
-    EMPTY, OK, copy_polygon, cut_loaded, keep_contradiction, keep_ring, load_ring, mark_cuts,
-)  # fmt: skip
+    EMPTY,
+    OK,
+    copy_polygon,
+    cut_loaded,
+    keep_contradiction,
+    keep_ring,
+    load_ring,
+    mark_cuts,
+)
 from torchfsid.kernels.saturation import BOUNDS, POINTS, ROWS, TOUCHING, clipped_inverse_optimal
 from torchfsid.tolerances import SPREAD
 
@@ -78,8 +85,8 @@ def evidence(
     # Arrays in the place of those that are missing are not read.
     given = rows, sample, bounds, (angles[0] if angles else sample[2], corners[0] if corners else sample[0])
     first, second, by_norm, dead_speed = clip or (1.0, 1.0, False, 0.0)
-    values = tolerance, first, second, dead_speed, int(by_norm), B, *bounds[0].shape, *bounds[1].shape, *bounds[2].shape
-    launch_by_address(kernel, B, given, values, results, stream)
+    limits, sizes = (first, second, dead_speed, int(by_norm)), [extent for array in bounds for extent in array.shape]
+    launch_by_address(kernel, B, given, (tolerance, *limits, B, *sizes), results, stream)
 
 
 def details(given: Sequence[Arrays], values: tuple[float], results: Sequence[Arrays], stream: int = 0) -> None:
