@@ -77,7 +77,8 @@ def places(F: int, R: int) -> list[tuple[tuple[int, ...], type]]:
 @item
 @no_type_check
 def entry(work, t, F, R, small):
-    """The `Scratch` of thread t in the arrays `work`, for which there are `places`.
+    """The `Scratch` of thread t in the arrays `work`, for which there are `places`. A launcher for the CPU cannot call
+    it: references to its parts are not counted.
 
     `small` are arrays of the thread: box (3, 2), proof (4,), far (3,), centre (3,), small systems (6, 3, 3), and middle
     (3,), axes (3, 3) and scale (3,) of the frame.
