@@ -80,7 +80,7 @@ def launch(kernel: str, tensors: Sequence[Sequence[Tensor]], values: Sequence[An
     """
     module, name = kernel.split(".")
     function: Callable = getattr(import_module(f"torchfsid.kernels.cuda.{module}"), name)
-    given = [tuple(map(side_by_side, part)) for part in tensors]
+    given = [tuple(_array(side_by_side(tensor)) for tensor in part) for part in tensors]
     filled = [tuple(map(_array, part)) for part in results]
     if SIMULATED:
         function(given, values, filled)
@@ -105,9 +105,9 @@ def scratch(places: Sequence[tuple[Sequence[int], type]], items: int, like: Tens
     return [empty((threads, *shape), like, torch.from_numpy(np.empty(0, kind)).dtype) for shape, kind in places]
 
 
-def side_by_side(tensor: Tensor) -> Any:
-    """The numbers of a tensor as kernels take them. They are copied on the device unless neighbours are adjacent."""
-    return _array(_reversed(_reversed(tensor.detach()).contiguous()))
+def side_by_side(tensor: Tensor) -> Tensor:
+    """The tensor as kernels take it. It is copied on the device unless neighbours are adjacent."""
+    return _reversed(_reversed(tensor.detach()).contiguous())
 
 
 def _reversed(tensor: Tensor) -> Tensor:

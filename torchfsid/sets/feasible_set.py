@@ -132,7 +132,7 @@ class FeasibleSet:
     def dim(self) -> int:
         return self.body.A.shape[-1]
 
-    @property
+    @cached_property
     def is_empty(self) -> Bool[Tensor, "*batch"]:
         return self.outcome == Status.EMPTY
 

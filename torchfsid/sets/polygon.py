@@ -166,8 +166,9 @@ class Polygon:
             device.empty((B, 3, 2), b), device.empty((B, 3), b), device.empty((B, 3), b), device.empty((B, 3), b, ints),
         )  # fmt: skip
         late = torch.zeros(B + 1, dtype=torch.int32, device=b.device)
-        parts, rows = (*ring, *numbers, self.reach), (A, b, time, source)
-        device.launch("planar.clip", (self.fields(), rows), (most, first > 0), (parts, found, lost, (late,)))
+        fields = tuple(map(device.side_by_side, self.fields()))
+        parts, rows = (*ring, *numbers, fields[-1]), (A, b, time, source)
+        device.launch("planar.clip", (fields, rows), (most, first > 0), (parts, found, lost, (late,)))
         body = Polygon(*parts, sheets=self.sheets)
         if first > 0:
             new = (body.label < 0).nonzero(as_tuple=True)
