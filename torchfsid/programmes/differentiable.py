@@ -19,17 +19,16 @@ from collections.abc import Callable
 from inspect import signature
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchfsid import device
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, lengths
 from torchfsid.kernels.active_rows import simplex_around
 from torchfsid.outcome import Status
-from torchfsid.programmes import exact, on_device
+from torchfsid.programmes import exact
+from torchfsid.programmes.on_tensors import on_items
 
 
 class NearestPoint(NamedTuple):
@@ -329,24 +328,6 @@ def _definite(metric: Tensor | None, ok: Tensor) -> Tensor | None:
 
 def times(M: Tensor, v: Tensor) -> Tensor:
     return (M @ v.unsqueeze(-1)).squeeze(-1)
-
-
-def on_items(of: Callable[..., tuple], A: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
-    """Apply a function of `exact` to tensors with any number of batch dimensions. A is (*batch, m, p).
-
-    On a device with kernels it is the function of `on_device` with the same name.
-    """
-    batch, where = A.shape[:-2], A.device
-    if device.has_kernels(A, *others):
-        items = (t.detach().reshape((batch.numel(), *t.shape[len(batch) :])) for t in (A, *others))
-        found = getattr(on_device, of.__name__)(*items)
-        return found if len(batch) == 1 else tuple(part.reshape((*batch, *part.shape[1:])) for part in found)
-    arrays = (
-        t.detach().cpu().contiguous().numpy().reshape((batch.numel(), *t.shape[len(batch) :])) for t in (A, *others)
-    )
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        found = of(*arrays)
-    return tuple(torch.from_numpy(array.reshape((*batch, *array.shape[1:]))).to(where) for array in found)
 
 
 def in_front(size: int, dims: tuple, inputs: tuple) -> list[Tensor | float | None]:

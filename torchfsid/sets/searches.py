@@ -18,12 +18,16 @@ from torchfsid.kernels import disc, extent, foot
 
 REAL, INDEX, MASK = torch.float64, torch.long, torch.bool
 
+Shapes = Sequence[tuple[Sequence[int], torch.dtype]]
+
 
 def farthest(vertices: Float[Tensor, "B V p"]) -> tuple[Int[Tensor, "B 2"], Float[Tensor, "B"]]:
     """The numbers of the two farthest vertices of each set, and their distance."""
+    given = (vertices,)
+    if not device.has_kernels(*given):
+        return _on_cpu(extent.farthest, given)
     B = len(vertices)
-    ends, distance = _searched(extent.farthest, (vertices,), [((B, 2), INDEX), ((B,), REAL)])
-    return ends, distance
+    return _on_device("farthest", given, [((B, 2), INDEX), ((B,), REAL)])
 
 
 def contains(
@@ -35,20 +39,22 @@ def contains(
     tolerance: float,
 ) -> Bool[Tensor, "B K"]:
     """Whether points are in sets, see `kernels.extent.contains`."""
-    given, shapes = (vertices, A, b, reach, points), [(points.shape[:2], MASK)]
-    (inside,) = _searched(extent.contains, given, shapes, values=(tolerance,))
-    return inside
+    given = vertices, A, b, reach, points
+    if not device.has_kernels(*given):
+        return _on_cpu(extent.contains, given, tolerance)[0]
+    return _on_device("contains", given, [(points.shape[:2], MASK)], values=(tolerance,))[0]
 
 
 def inscribed(
     vertices: Float[Tensor, "B V 2"], A: Float[Tensor, "B V 2"], b: Float[Tensor, "B V"], count: Int[Tensor, "B"]
 ) -> tuple[Float[Tensor, "B 2"], Float[Tensor, "B"], Int[Tensor, "B 3"], Bool[Tensor, "B"]]:
     """The largest discs of polygons: centre, radius, the rows that decide them, and whether they were found."""
+    given = vertices, A, b, count
+    if not device.has_kernels(*given):
+        return _on_cpu(disc.inscribed, given)
     B, V = b.shape
-    shapes = [((B, 2), REAL), ((B,), REAL), ((B, 3), INDEX), ((B,), MASK)]
-    lines = [((B, V, 2), REAL), ((B, V), REAL)]
-    centre, radius, rows, found = _searched(disc.inscribed, (vertices, A, b, count), shapes, lines)
-    return centre, radius, rows, found
+    shapes, lines = [((B, 2), REAL), ((B,), REAL), ((B, 3), INDEX), ((B,), MASK)], [((B, V, 2), REAL), ((B, V), REAL)]
+    return _on_device("inscribed", given, shapes, lines)
 
 
 def feet(
@@ -60,30 +66,20 @@ def feet(
     metric: Float[Tensor, "B 2 2"],
 ) -> tuple[Float[Tensor, "B 2"], Int[Tensor, "B 2"]]:
     """The nearest points of polygons and their active rows, see `kernels.foot.feet`."""
-    shapes = [((len(b), 2), REAL), ((len(b), 2), INDEX)]
-    nearest, active = _searched(foot.feet, (vertices, A, b, count, point, metric), shapes)
-    return nearest, active
-
-
-def _searched(
-    on_cpu: Callable[..., tuple],
-    given: Sequence[Tensor],
-    shapes: Sequence[tuple[Sequence[int], Any]],
-    scratch: Sequence[tuple[Sequence[int], Any]] = (),
-    values: tuple = (),
-) -> tuple[Tensor, ...]:
-    """What a kernel finds.
-
-    Args:
-        on_cpu: the kernel for the CPU. That for a device is the function of `kernels.cuda.programmes` of the same name.
-        given: what it reads.
-        shapes: the shapes and dtypes of its results.
-        scratch: those of its scratch on the device.
-        values: what it takes as numbers.
-    """
-    like = given[0]
+    given = vertices, A, b, count, point, metric
     if not device.has_kernels(*given):
-        return tuple(torch.from_numpy(part).to(like.device) for part in on_cpu(*map(array, given), *values))
-    work, found = (tuple(device.empty(shape, like, dtype) for shape, dtype in part) for part in (scratch, shapes))
-    device.launch(f"programmes.{on_cpu.__name__}", (given,), values, (work, found) if work else (found,))
-    return found
+        return _on_cpu(foot.feet, given)
+    return _on_device("feet", given, [((len(b), 2), REAL), ((len(b), 2), INDEX)])
+
+
+def _on_cpu(kernel: Callable[..., tuple], given: Sequence[Tensor], *values: Any) -> Any:
+    """What a kernel finds on the CPU, as tensors where the given ones are."""
+    found, like = tuple(map(torch.from_numpy, kernel(*map(array, given), *values))), given[0]
+    return found if like.is_cpu else tuple(part.to(like.device) for part in found)
+
+
+def _on_device(kernel: str, given: Sequence[Tensor], shapes: Shapes, scratch: Shapes = (), values: tuple = ()) -> Any:
+    """What a kernel of `kernels.cuda.programmes` finds, given the shapes and dtypes of its results and its scratch."""
+    parts = [[device.empty(shape, given[0], dtype) for shape, dtype in part] for part in (scratch, shapes) if part]
+    device.launch(f"programmes.{kernel}", (given,), values, parts)
+    return tuple(parts[-1])
