@@ -93,7 +93,7 @@ def compare(where: str = "cuda", placements: Sequence[int] = PLACEMENTS) -> dict
             }
             results[str(count)] = row
             print(
-                f"  gradient step of the probe design, {count} placements x {GOALS} goals: device {taken * 1e3:9.3f} ms, "
+                f"  gradient step of the probe design, {count} x {GOALS} items: {where} {taken * 1e3:9.3f} ms, "
                 f"one core {spent * 1e3:9.1f} ms, ratio {row['ratio']:.1f}; value {value:.6f}, differs by "
                 f"{row['value_difference']:.0e}, gradient by {row['gradient_difference']:.0e} of its norm",
                 flush=True,

@@ -1,4 +1,4 @@
-"""Counts of what tensors on a device would wait for, by the operations of torch that are called with tensors on a CPU."""
+"""Counts of what the host would wait for if tensors were on a device, by the operations of torch on a CPU."""
 
 from __future__ import annotations
 

@@ -43,7 +43,9 @@ from torch import Tensor
 
 from experiments.design.runs import Runs, run
 from torchfsid.halfspaces import Halfspaces
+from torchfsid.identification.critical_region import critical_region
 from torchfsid.identification.evidence import ObservationModel, SetKind, evidence
+from torchfsid.identification.inverse_optimal import inverse_optimal_set
 from torchfsid.robots.avoidance import CollisionAvoidance
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.controller import CbfQpController
@@ -219,7 +221,8 @@ class Probing:
         """What is left of Theta with every placement and every goal.
 
         The evidence of a sample does not depend on Theta, so all samples are read at once. Samples with a facet in
-        Theta(T) are read once more with gradients, which these facets then carry. The others do not change Theta(T).
+        Theta(T) become half-spaces once more, with gradients, which these facets then carry. The others do not change
+        Theta(T).
 
         Args:
             placements: way-points [m], or None for no probe.
@@ -227,9 +230,9 @@ class Probing:
             steps: number of samples. Default: the whole run.
         """
         scene, runs = self.to(goals.device), self.run(placements, goals, steps)
-        (B, T), seen = runs.feasible.shape, runs.measurement()
+        (B, T), seen, prior = runs.feasible.shape, runs.measurement(), scene.prior_of(1)
         with torch.no_grad():
-            found = evidence(self.model, scene.prior_of(1), seen)
+            found = evidence(self.model, prior, seen)
             omega, R = found.omega, found.omega.rows
             parts = (part.unflatten(0, (B, T)).flatten(1, 2) for part in (omega.A, omega.b))
             theta = scene.prior_of(B).intersect(Halfspaces(*parts))
@@ -247,10 +250,19 @@ class Probing:
             x, u = (part.flatten(0, 1).index_select(0, sample) for part in runs.along(path))
             probe = path.flatten(0, 1).index_select(0, sample // (T * len(goals)) * T + sample % T)
             bodies = torch.cat([again.bodies[:, :-1], probe.unsqueeze(1)], dim=1)
-            told = evidence(self.model, scene.prior_of(1), replace(again, x=x, u=u, bodies=bodies)).omega
+            told = self._omega(replace(again, x=x, u=u, bodies=bodies), found.kkt.active[sample])
             theta = carried(theta, (item, slot), told.select(of_facet))
         area = torch.where(sound, theta.volume(), self.prior_area)
         return Left(area.reshape(-1, len(goals)), sound.reshape(-1, len(goals)))
+
+    def _omega(self, informative: Measurement, active: Bool[Tensor, "B m"]) -> Halfspaces:
+        """The half-spaces of `evidence`, given the rows that were found to be active."""
+        rows, (C, d), u = self.avoidance(informative), self.task(informative), informative.u
+        if self.kind == "critical_region":
+            return critical_region(rows, active, C, d)
+        assert u is not None
+        assert self.noise is not None
+        return inverse_optimal_set(rows, u, C, d, self.noise)
 
 
 def along(placements: Float[Tensor, "P K 2"], fraction: float | Float[Tensor, "T"]) -> Float[Tensor, "P *T 2"]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
 
@@ -34,7 +34,7 @@ def measurement() -> Measurement:
 
 
 @pytest.fixture
-def counted(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Callable], RoundTrips]]:
+def counted(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable], RoundTrips]:
     """The round trips of a function, of which each kernel is one launch."""
     counting, real = RoundTrips(), device.launch
 
@@ -49,7 +49,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Callable], Ro
         return counting
 
     monkeypatch.setattr(device, "launch", launch)
-    yield count
+    return count
 
 
 @pytest.mark.parametrize("barriers", [[BARRIER], [BARRIER, SpeedBox((2.0, 2.0)), WALLS]])

@@ -92,7 +92,12 @@ class ObservationModel:
         if not self.active_tolerance > 0:
             raise InputError("active_tolerance", "a positive number [units of the control]", self.active_tolerance)
 
-    @property
+    @cached_property
+    def bounds(self) -> NoiseBound:
+        """The declared bounds. The critical region without any needs the slack of its active rows only."""
+        return NoiseBound(0.0, self.active_tolerance) if self.noise is None else self.noise
+
+    @cached_property
     def relaxes(self) -> bool:
         """Does the controller take the least violation of rows that are infeasible (`Barrier.relaxes`)?"""
         return any(getattr(barrier, "relaxes", False) for barrier in self.barriers)
@@ -245,7 +250,7 @@ def sample_of(model: ObservationModel, theta: FeasibleSet, measurement: Measurem
     if measurement.x.ndim != 2 or len(theta.batch_shape) != 1 or items % max(robots, 1) != 0:
         expected = f"a batch of {tuple(theta.batch_shape)} robots, or several of them"
         raise InputError("measurement", expected, tuple(measurement.x.shape))
-    noise = NoiseBound(0.0, model.active_tolerance) if model.noise is None else model.noise.of_samples(robots, items)
+    noise = model.bounds.of_samples(robots, items)
     errors, of_rows, corners = ErrorBounds.of(measurement, noise), None, None
     if errors is None and any(getattr(barrier, "uncertain", False) for barrier in model.barriers):
         errors = ErrorBounds.of_controls(measurement, noise)

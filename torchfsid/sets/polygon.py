@@ -193,11 +193,14 @@ class Polygon:
         """The corners, each the solution of its two rows."""
         if not self._differentiable():
             return self.corners
-        return derivatives.vertices(*self.rows(), self._skeleton())
+        return derivatives.vertices(*self.rows(), self._skeleton(self._triangles().sum(-1)))
 
     def volume(self) -> Float[Tensor, "B"]:
         """The area by the shoelace formula about the first corner, which is accurate for thin polygons."""
-        return self._measure()[0] if self._differentiable() else self._triangles().sum(-1)
+        area = self._triangles().sum(-1)
+        if not self._differentiable():
+            return area
+        return derivatives.measure(*self.rows(), area, self.corners[:, 0], self._skeleton(area))[0]
 
     def centroid(self) -> Float[Tensor, "B 2"]:
         """The centre of area. If the area is lost in round-off, it is the middle of the bounding box."""
@@ -270,7 +273,7 @@ class Polygon:
         middle = (self.corners.amin(1) + self.corners.amax(1)) / 2
         centroid = torch.where(solid.unsqueeze(-1), centroid, middle)
         if self._differentiable():
-            return derivatives.measure(*self.rows(), area, centroid, self._skeleton())
+            return derivatives.measure(*self.rows(), area, centroid, self._skeleton(area))
         return area, centroid
 
     def _solid(self, area: Float[Tensor, "B"]) -> Bool[Tensor, "B"]:
@@ -278,14 +281,14 @@ class Polygon:
         size = (self.corners.amax(1) - self.corners.amin(1)).amax(-1)
         return area > ROUND_OFF * size * torch.maximum(size, self.corners.abs().amax((1, 2)))
 
-    def _skeleton(self) -> Skeleton:
+    def _skeleton(self, area: Float[Tensor, "B"]) -> Skeleton:
         slot, count = torch.arange(self.slots, device=self.count.device), self.count.unsqueeze(-1)
         here = torch.where(slot < count, slot, 0)
         bases = torch.stack([(here - 1) % count, here], dim=-1)
         rows = at(self.A, bases)
         ends = torch.stack([here, torch.where(slot < count, (slot + 1) % count, 0)], dim=-1)
         solved, facet = independent(rows[:, :, 0], rows[:, :, 1]), slot.expand(self.b.shape)
-        return Skeleton(self.corners, bases, solved, ends, facet, self._solid(self._triangles().sum(-1)))
+        return Skeleton(self.corners, bases, solved, ends, facet, self._solid(area))
 
     def _disc_by_programme(self) -> tuple[Float[Tensor, "B 2"], Float[Tensor, "B"]]:
         """The inscribed disc by `programmes.inscribed_ball`, which works in any dimension."""
