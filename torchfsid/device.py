@@ -24,6 +24,8 @@ from torchfsid.kernels.compiled import SIMULATED
 
 INSTALL = "pip install 'torchfsid[cuda]', with numba-cuda[cu12] or [cu13] where there is no CUDA toolkit"
 
+KINDS = {np.float64: torch.float64, np.int64: torch.int64, np.int32: torch.int32, np.bool_: torch.bool}
+
 SCRATCH = 2**30
 """Largest size of the scratch of all threads of a kernel [bytes]."""
 
@@ -102,7 +104,7 @@ def scratch(places: Sequence[tuple[Sequence[int], type]], items: int, like: Tens
     """
     each = sum(prod(shape) * np.dtype(kind).itemsize for shape, kind in places)
     threads = min(items, max(SCRATCH // each, 1))
-    return [empty((threads, *shape), like, torch.from_numpy(np.empty(0, kind)).dtype) for shape, kind in places]
+    return [empty((threads, *shape), like, KINDS[kind]) for shape, kind in places]
 
 
 def side_by_side(tensor: Tensor) -> Tensor:

@@ -85,7 +85,7 @@ def _unclipped(
     wishes, margin = sample.corners @ C.mT + d.unsqueeze(-2), torch.atleast_1d(sample.drift)
     farthest = wishes.norm(dim=-1).amax(-1, keepdim=True) + margin.unsqueeze(-1)
     # A limit beyond every possible nominal control is no limit, and may be replaced by any finite one.
-    limits = torch.minimum(d.new_tensor(saturation.limits), 2 * farthest).clamp(min=LEAST_LIMIT)
+    limits = torch.minimum(device.constant(tuple(saturation.limits), d.device), 2 * farthest).clamp(min=LEAST_LIMIT)
     own = Halfspaces(admissible.A, admissible.b)
     stamp, of_box = torch.zeros_like(own.b), torch.zeros_like(admissible.source)
     cut = Polyhedron.from_box(-limits, limits).clip(own.A, own.b, stamp, of_box, own.rows + 6)
@@ -93,14 +93,11 @@ def _unclipped(
     polyhedra, nominal = (cut.body.corners, cut.body.count, cut.outcome, limits), (C, d, wishes, margin)
     no_row, by_norm, dead_speed = 2 * sample.rows.rows, saturation.shape == "norm", float(saturation.dead_speed)
     if not device.has_kernels(own.b, d):
-        arrays = (tuple(map(array, part)) for part in (found, polyhedra, nominal))
-        of_Q, of_cut, of_nominal = arrays
-        rows = clipped.unclipped_in_space(
-            (*of_Q, no_row), of_cut, of_nominal, (by_norm, dead_speed), array(informative)
-        )
+        of_Q, of_cut, of_nominal = (tuple(map(array, part)) for part in (found, polyhedra, nominal))
+        of_Q, clip = (*of_Q, no_row), (by_norm, dead_speed)
+        rows = clipped.unclipped_in_space(of_Q, of_cut, of_nominal, clip, array(informative))
         return Halfspaces(*map(torch.from_numpy, rows))
-    (B, R), p = own.b.shape, C.shape[-1]
-    R = clipped.rows_for(R)
+    B, R, p = len(d), clipped.rows_for(own.rows), C.shape[-1]
     results = device.empty((B, R, p), d), device.empty((B, R), d), device.empty((B, R), d, LONG)
     work = device.scratch(clipped.places(cut.body.corners.shape[1]), B, d)
     given = found, polyhedra, nominal, (informative,)

@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchfsid.device import constant
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.sets import compiled_polyhedron as compiled
 from torchfsid.sets import derivatives, recentred, searches
@@ -79,23 +80,23 @@ class Polyhedron:
     @classmethod
     def from_box(cls, lower: Float[Tensor, "B 3"], upper: Float[Tensor, "B 3"]) -> Polyhedron:
         """Axis-parallel boxes. Facets: first the lower sides -z_i <= -lower_i, then the upper sides z_i <= upper_i."""
-        B, device = len(lower), lower.device
-        unit, b = torch.eye(3, dtype=lower.dtype, device=device), torch.cat([-lower, upper], dim=-1)
+        B, where = len(lower), lower.device
+        unit, b = torch.eye(3, dtype=lower.dtype, device=where), torch.cat([-lower, upper], dim=-1)
         A = torch.cat([-unit, unit]).expand(B, 6, 3)
-        is_upper = torch.tensor(list(product([False, True], repeat=3)), device=device)
+        is_upper = constant(tuple(product([False, True], repeat=3)), where, torch.bool)
         label, sheets = torch.zeros_like(b).long(), Sheets()
         if torch.is_grad_enabled() and b.requires_grad:
-            label = 1 + torch.arange(b.numel(), device=device).reshape(b.shape)
+            label = 1 + torch.arange(b.numel(), device=where).reshape(b.shape)
             sheets = sheets.with_sheet(A.flatten(0, 1), b.flatten())
         return cls(
             corners=torch.where(is_upper, upper.unsqueeze(1), lower.unsqueeze(1)).detach(),
-            meets=(torch.arange(3, device=device) + 3 * is_upper).expand(B, 8, 3),
+            meets=(torch.arange(3, device=where) + 3 * is_upper).expand(B, 8, 3),
             A=A,
             b=b.detach(),
             time=torch.full_like(b.detach(), nan),
             source=torch.full_like(label, PRIOR),
             label=label,
-            count=torch.full((B,), 6, device=device),
+            count=torch.full((B,), 6, device=where),
             reach=torch.maximum(lower.abs(), upper.abs()).detach(),
             sheets=sheets,
         )
