@@ -1,7 +1,7 @@
 """python -m benchmarks cuda [--sizes 10000 100000 1000000] [--steps 12]
 
-A fleet's sets on a GPU (8 neighbours, noisy controls, see `scenario`), the exact layers (`cuda_layers`) and a gradient
-step of the probe design (`cuda_probe`). Each part prints its own lines and is saved when it is done. One that fails
+A fleet's sets on a GPU (8 neighbours, noisy controls, see `scenario`), the exact layers (`cuda_layers`), a gradient
+step of the probe design (`cuda_probe`), and robots in space (`cuda_space`). Each part prints its own lines and is saved when it is done. One that fails
 prints why, and the others go on. Truths lost must be 0.
 
 Read and clip: what a measurement says of each robot, and the cut of its set, from rows on the device that lie side by
@@ -181,8 +181,12 @@ def line_of(run: dict, bandwidth: float) -> str:
     if run["compiled"] and on_device:
         share = run["bytes"] / bandwidth / run["kernels_s"]
         line += f"; {run['bytes'] / robots:.0f} bytes each, {share:.1%} of a copy's speed\n{'':27s}host busy "
-        line += f"{run['kernels_host_s'] * 1e3:.3f} ms of read and clip, {run['update_host_s'] * 1e3:.3f} ms of an update"
-        line += f"; on the device read {run['read_on_device_s'] * 1e3:.3f} ms, clip {run['clip_on_device_s'] * 1e3:.3f} ms"
+        line += (
+            f"{run['kernels_host_s'] * 1e3:.3f} ms of read and clip, {run['update_host_s'] * 1e3:.3f} ms of an update"
+        )
+        line += (
+            f"; on the device read {run['read_on_device_s'] * 1e3:.3f} ms, clip {run['clip_on_device_s'] * 1e3:.3f} ms"
+        )
     return f"{line}; truths lost {run['truths_lost']}"
 
 
@@ -223,6 +227,7 @@ def main(arguments: list[str]) -> None:
         "fleet": partial(fleets, options.sizes, options.steps),
         "layers": lambda: import_module("benchmarks.cuda_layers").compare(),
         "probe": lambda: import_module("benchmarks.cuda_probe").compare(),
+        "space": lambda: import_module("benchmarks.cuda_space").compare(),
     }
     results, began = {}, time.perf_counter()
     for name, part in parts.items():

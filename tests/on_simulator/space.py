@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks import cuda_space
 from tests import test_evidence_kernel as scenes_in_the_plane
 from tests import test_saturation_in_space as clipped
 from tests import test_sets_in_space as scenes
@@ -183,6 +184,12 @@ def test_the_observer_is_the_same(task: Task, launched: list[str]) -> None:
         scenes_in_the_plane.outline(event) for event in other.events
     ]
     assert mine.events
+
+
+def test_the_section_of_the_benchmark_runs() -> None:
+    for run in cuda_space.compare(2, "cpu", 3)["runs"]:
+        assert run["truths_lost"] == 0
+        assert run["largest_relative_difference"] == 0
 
 
 def test_there_may_be_no_robots() -> None:
