@@ -54,7 +54,7 @@ def simulated(robots: int, steps: int) -> tuple[Fleet, list[Measurement]]:
 
 
 def fleet_of(robots: int, steps: int, where: str) -> tuple[FeasibleSet, Tensor, list[Measurement]]:
-    """The priors, the goals and the measurements of a fleet. A large one repeats a smaller one, simulated on the CPU."""
+    """The priors, the goals and the measurements of a fleet. A large one repeats one simulated on the CPU."""
     fleet, parts = simulated(min(robots, SIMULATED_ROBOTS), steps)
     times = robots // len(fleet.goals)
 
@@ -181,12 +181,9 @@ def line_of(run: dict, bandwidth: float) -> str:
     if run["compiled"] and on_device:
         share = run["bytes"] / bandwidth / run["kernels_s"]
         line += f"; {run['bytes'] / robots:.0f} bytes each, {share:.1%} of a copy's speed\n{'':27s}host busy "
-        line += (
-            f"{run['kernels_host_s'] * 1e3:.3f} ms of read and clip, {run['update_host_s'] * 1e3:.3f} ms of an update"
-        )
-        line += (
-            f"; on the device read {run['read_on_device_s'] * 1e3:.3f} ms, clip {run['clip_on_device_s'] * 1e3:.3f} ms"
-        )
+        host, update = run["kernels_host_s"] * 1e3, run["update_host_s"] * 1e3
+        line += f"{host:.3f} ms of read and clip, {update:.3f} ms of an update; on the device read "
+        line += f"{run['read_on_device_s'] * 1e3:.3f} ms, clip {run['clip_on_device_s'] * 1e3:.3f} ms"
     return f"{line}; truths lost {run['truths_lost']}"
 
 

@@ -28,11 +28,15 @@ AS_NUMBERS = {torch.Tensor.numpy, torch.Tensor.tolist, torch.Tensor.__array__}
 """Methods that give numbers to the host, which call no operation of a tensor on a CPU."""
 
 
+ADDRESSES = {"_array"}
+"""Functions of `device` in which arrays stand for addresses, in numba's simulator."""
+
+
 class RoundTrips(TorchDispatchMode):
     """The number of operations, and where in the package they would make a device and the host wait.
 
     Attributes:
-        operations: the number of launches on a device.
+        operations: the number of launches on a device, kernels not counted.
         waits: for each (file, line, operation), how often.
     """
 
@@ -58,7 +62,7 @@ class RoundTrips(TorchDispatchMode):
 
     def _wait(self, name: str) -> None:
         frames = [frame for frame in traceback.extract_stack() if frame.filename.startswith(PACKAGE)]
-        if frames:
+        if frames and frames[-1].name not in ADDRESSES:
             self.waits[Path(frames[-1].filename).name, frames[-1].lineno, name] += 1
 
 

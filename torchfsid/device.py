@@ -109,7 +109,9 @@ def scratch(places: Sequence[tuple[Sequence[int], type]], items: int, like: Tens
 
 def side_by_side(tensor: Tensor) -> Tensor:
     """The tensor as kernels take it. It is copied on the device unless neighbours are adjacent."""
-    return _reversed(_reversed(tensor.detach()).contiguous())
+    tensor = tensor.detach() if tensor.requires_grad else tensor
+    flipped = _reversed(tensor)
+    return tensor if flipped.is_contiguous() else _reversed(flipped.contiguous())
 
 
 def _reversed(tensor: Tensor) -> Tensor:

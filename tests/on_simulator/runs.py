@@ -1,4 +1,4 @@
-"""Closed loops and the probe design, for a process with NUMBA_ENABLE_CUDASIM=1. See `tests.on_simulator.planar`."""
+"""Closed loops and the probe design, for a process with NUMBA_ENABLE_CUDASIM=1. See `tests.test_cuda` and `_both`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from experiments.design.probe import Probing
-from tests.on_simulator.planar import both, launched, same
+from tests.on_simulator._both import both, launched, same
 from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.tasks import GoalTask
 

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
 from numba import cuda
 
 from torchfsid.kernels.compiled import SIMULATED
@@ -29,10 +30,19 @@ def probe() -> None:
     """Import what a first kernel needs.
 
     Raises:
-        AttributeError: numba-cuda does not fit numpy (0.30 fails with numpy 2.5).
+        AttributeError: numba-cuda does not fit numpy.
     """
-    if importlib.util.find_spec("numba.cuda.np") is not None:  # numba's own CUDA target, without numba-cuda, has none
+    if importlib.util.find_spec("numba.cuda.np") is None:  # numba's own CUDA target, without numba-cuda, has none
+        return
+    dropped = "row_stack"  # numpy 2.5 has no such alias of `vstack`; numba-cuda, up to 0.30.4, imports it
+    lent = not hasattr(np, dropped)
+    if lent:
+        setattr(np, dropped, np.vstack)
+    try:
         importlib.import_module("numba.cuda.np.arrayobj")
+    finally:
+        if lent:
+            delattr(np, dropped)
 
 
 def launch(
