@@ -24,6 +24,7 @@ from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.tasks import GoalTask, Task, UnknownGainGoalTask
+from torchfsid.sets import compiled_polyhedron
 from torchfsid.sets.feasible_set import FeasibleSet
 
 __all__ = ["launched"]  # a fixture
@@ -95,6 +96,18 @@ def test_full_polyhedra_are_merged_alike(monkeypatch: pytest.MonkeyPatch) -> Non
     one, other = both(lambda: cubes(2).intersect(rows(2, 5, 3)).body.merge(7))
     for mine, theirs in zip(one._resized(7), other._resized(7), strict=True):
         same(mine, theirs)
+
+
+def test_a_polyhedron_that_does_not_fit_stays_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither more facets than slots, nor a smaller set than is true: only the second row replaces a facet."""
+    real = compiled_polyhedron._empty
+    monkeypatch.setattr(compiled_polyhedron, "_empty", lambda B, F, like: real(B, 6, like))
+    A, b = torch.ones(3, 1, 3, dtype=torch.float64), torch.ones(3, 1, dtype=torch.float64)
+    A[1] *= torch.tensor([1.0, 0, 0])
+    b[1] = 0.5
+    found = cubes(3).intersect(Halfspaces(A, b), 1.0)
+    assert found.volume().tolist() == [8.0, 6.0, 8.0]
+    assert found.last_cut.isnan().tolist() == [True, False, True]
 
 
 def test_emptiness_comes_with_its_proof() -> None:
