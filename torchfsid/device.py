@@ -59,9 +59,15 @@ def any_of(*masks: Tensor) -> list[bool]:
     return [bool(mask.any()) for mask in masks] if on_host(*masks) else torch.stack([m.any() for m in masks]).tolist()
 
 
-@lru_cache(maxsize=256)
 def constant(values: tuple, where: torch.device, dtype: torch.dtype = torch.float64) -> Tensor:
     """Numbers of the host as a tensor on a device, to which they are copied once. It must not be changed."""
+    if torch._C._are_functorch_transforms_active():  # tensors that are made there must not outlive the transform
+        return torch.tensor(values, dtype=dtype, device=where)
+    return _kept(values, where, dtype)
+
+
+@lru_cache(maxsize=256)
+def _kept(values: tuple, where: torch.device, dtype: torch.dtype) -> Tensor:
     with torch.inference_mode(False):
         return torch.tensor(values, dtype=dtype, device=where)
 

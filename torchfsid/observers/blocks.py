@@ -61,7 +61,7 @@ def times_of(samples: Measurement, robots: int) -> Float[Tensor, "S"]:
     """
     items = len(samples.x)
     if samples.x.ndim == 2 and items == robots:
-        return torch.tensor([samples.time], dtype=torch.float64)
+        return torch.tensor([samples.time], dtype=torch.float64, device="cpu")
     if samples.x.ndim != 2 or robots == 0 or items == 0 or items % robots != 0:
         raise InputError("measurement", f"samples of {robots} robots, concatenated", tuple(samples.x.shape))
     times = (
