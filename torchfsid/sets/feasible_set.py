@@ -155,7 +155,7 @@ class FeasibleSet:
         if halfspaces.dim != p or not given.fits(halfspaces.batch_shape, self.batch_shape):
             expected = f"rows over R^{p} for a batch {tuple(self.batch_shape)}"
             raise InputError("halfspaces", expected, (tuple(halfspaces.A.shape), tuple(halfspaces.b.shape)))
-        waits = p != 2 or not has_kernels(halfspaces.A, halfspaces.b, self.outcome)
+        waits = p not in (2, 3) or not has_kernels(halfspaces.A, halfspaces.b, self.outcome)
         if waits and not finite(halfspaces.A, halfspaces.b):
             raise InputError("halfspaces", "finite rows", "NaN or infinity")
         if m == 0:
