@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchfsid.errors import InputError
-from torchfsid.halfspaces import Halfspaces
+from torchfsid.halfspaces import Halfspaces, lengths
 from torchfsid.robots.arguments import require_numbers
 from torchfsid.robots.avoidance import ClassK, NeighbourVelocity
 from torchfsid.robots.bounds import ErrorBounds, RowErrors
@@ -122,10 +122,16 @@ def controller_failed(
     slow = measurement.u.norm(dim=-1) <= error
     if not bool(slow.any()):
         return slow
-    stopped, sizes = (measurement.u == 0).all(-1), rows.norms()
-    least = torch.zeros_like(rows.b) if errors is None else errors.slack * sizes
-    clearly = rows.b < -least - error.unsqueeze(-1) * sizes
-    failed = stopped & (rows.b < least).any(-1) | slow & clearly.any(-1)
+    stopped, asked = (measurement.u == 0).all(-1), slow.unsqueeze(-1).expand_as(rows.b)
+    if errors is None:
+        asked = asked & (rows.b < 0)  # zero keeps the others
+    row = asked.flatten().nonzero().flatten()
+    robot, b, sizes = row // rows.rows, rows.b.flatten()[row], lengths(rows.A.flatten(0, -2)[row])
+    least = torch.zeros_like(b) if errors is None else errors.slack.expand_as(rows.b).flatten()[row] * sizes
+    clearly = b < -least - error.expand_as(slow).flatten()[robot] * sizes
+    failed = torch.zeros_like(slow).flatten()
+    failed[robot[stopped.flatten()[robot] & (b < least) | clearly]] = True
+    failed = failed.view_as(slow)
     perhaps_joint = any(getattr(barrier, "neighbour_velocity", None) in ("current", None) for barrier in barriers)
     controls = measurement.body_velocities if measurement.body_accelerations is None else measurement.body_accelerations
     if perhaps_joint and controls is not None:
