@@ -95,6 +95,7 @@ class MotionFile(TableFile):
         self._robots = [log.bodies.index(robot) for robot in robots]
         self._names = [line_of([body]) for body in log.bodies]
         self._radius = [[]] * len(log.bodies) if log.radius is None else texts(log.radius[:, None])
+        self._cells: dict[bytes, str] = {}
         self._stride, self._sample = max(1, math.ceil((len(log.t) - 1) / (MOST_TIMES - 1))), 0
 
     def see(self, estimates: SetEstimates) -> None:
@@ -110,15 +111,20 @@ class MotionFile(TableFile):
         log, unknown = self._log, "," * (self._log.x.shape[-1] - 1)
         t, positions = number(log.t[k]), lines_of(log.x[k])
         velocities = [unknown] * len(log.bodies) if log.u is None else lines_of(log.u[k])
-        names = [""] * len(log.bodies)
-        for i, row in np.argwhere(active).tolist():
-            j = self._robots[i]
-            names[j] += f"{names[j] and '; '}{self._labels[row]}"
-        known = log.velocity_known[k].tolist()
+        known, names = log.velocity_known[k].tolist(), [""] * len(log.bodies)
+        for j, rows in zip(self._robots, active, strict=True):
+            names[j] = self._named(rows)
         for j in log.seen[k].nonzero()[0].tolist():
             velocity = velocities[j] if known[j] else unknown
-            cells = [t, self._names[j], positions[j], velocity, *self._radius[j], names[j] and line_of([names[j]])]
-            yield ",".join(cells) + "\r\n"
+            yield ",".join([t, self._names[j], positions[j], velocity, *self._radius[j], names[j]]) + "\r\n"
+
+    def _named(self, active: Bool[np.ndarray, "m"]) -> str:
+        """The cell that names the active rows. They are few, and often the same."""
+        key = active.tobytes()
+        if key not in self._cells:
+            rows = active.nonzero()[0].tolist()
+            self._cells[key] = line_of(["; ".join([self._labels[row] for row in rows])]) if rows else ""
+        return self._cells[key]
 
 
 def _differ(size: tuple[float, float], written: tuple[float, float]) -> bool:

@@ -41,7 +41,7 @@ from torchfsid.commands.history import SetsFile
 from torchfsid.commands.interruption import uninterrupted
 from torchfsid.commands.results_folder import write_json
 from torchfsid.commands.safety_results import COLUMNS, Distances, SafetyColumns, refutation, safety, without_repeats
-from torchfsid.commands.table_file import TableFile, line_of, lines_of, number
+from torchfsid.commands.table_file import TableFile, line_of, lines_of
 from torchfsid.commands.where_to_look import constraint_name
 from torchfsid.halfspaces import array
 from torchfsid.identification.kkt import CASES
@@ -154,7 +154,7 @@ class ResultsWriter:
             first, place = _alike(sets, measurement.observed)
         ends = self._ends(measurement, estimate, others, described, torch.from_numpy(first))
         lines = [ends[k] for k in place.tolist()]
-        times = enumerate(map(number, sets.t.tolist()))
+        times = enumerate(lines_of(sets.t.unsqueeze(-1)))
         texts = [t.join(["", *lines[s * robots : (s + 1) * robots]]) for s, t in times]
         self._estimates.write_texts(texts)
         for s in sorted({0, *_changes(sets.which), samples - 1}):

@@ -125,13 +125,13 @@ def controller_failed(
     stopped, asked = (measurement.u == 0).all(-1), slow.unsqueeze(-1).expand_as(rows.b)
     if errors is None:
         asked = asked & (rows.b < 0)  # zero keeps the others
-    row = asked.flatten().nonzero().flatten()
-    robot, b, sizes = row // rows.rows, rows.b.flatten()[row], lengths(rows.A.flatten(0, -2)[row])
-    least = torch.zeros_like(b) if errors is None else errors.slack.expand_as(rows.b).flatten()[row] * sizes
-    clearly = b < -least - error.expand_as(slow).flatten()[robot] * sizes
-    failed = torch.zeros_like(slow).flatten()
-    failed[robot[stopped.flatten()[robot] & (b < least) | clearly]] = True
-    failed = failed.view_as(slow)
+    row = asked.nonzero(as_tuple=True)
+    robot, b, sizes = row[:-1], rows.b[row], lengths(rows.A[row])
+    least = torch.zeros_like(b) if errors is None else errors.slack.expand_as(rows.b)[row] * sizes
+    clearly = b < -least - error.expand_as(slow)[robot] * sizes
+    violated = torch.zeros_like(asked)
+    violated[row] = stopped[robot] & (b < least) | clearly
+    failed = violated.any(-1)
     perhaps_joint = any(getattr(barrier, "neighbour_velocity", None) in ("current", None) for barrier in barriers)
     controls = measurement.body_velocities if measurement.body_accelerations is None else measurement.body_accelerations
     if perhaps_joint and controls is not None:
