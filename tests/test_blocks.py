@@ -253,3 +253,21 @@ def test_a_bound_for_each_robot() -> None:
             assert_same_sets(fleet.feasible_set, one_by_one.feasible_set)
     with pytest.raises(InputError, match="a bound for each of 4 robots"):
         made(noise=NoiseBound(bounds[:3])).update(samples[0])
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_gain_for_each_robot() -> None:
+    gains = torch.tensor([[1.2], [1.5704], [2.0], [3.0]], dtype=torch.float64)
+    own = CollisionAvoidance(ClassK(gains), safety_distance=0.3515)
+    samples, one_by_one, in_blocks = team(3, broken=False)[:20], made(barrier=own), made(barrier=own)
+    for sample in samples:
+        one_by_one.update(sample)
+    for block in blocks(samples, 7):
+        list(in_blocks.read(block))
+    assert_same(in_blocks, one_by_one)
+    for robot, gain in enumerate(gains.flatten().tolist()):
+        alone = replace(own, class_k=ClassK(gain))
+        torch.testing.assert_close(own(samples[5]).b[robot], alone(samples[5]).b[robot], rtol=0, atol=0)
+    for threads in (2, 4):
+        with pytest.raises(InputError, match=f"class_k.gain: .* each of {4 // threads} robots"):
+            FleetObserver(made(barrier=own), threads).update(samples[0])

@@ -70,7 +70,12 @@ class Sight(NamedTuple):
 
 @dataclass(frozen=True)
 class ClassK:
-    """alpha(h) = gain sign(h) |h|^power, an extended class-K function. A gain (B, 1) is one for each robot."""
+    """alpha(h) = gain sign(h) |h|^power, an extended class-K function. A gain (B, 1) is one for each robot.
+
+    Raises:
+        InputError: gain or power is not positive. When called: h is not that of B robots, or of several of their
+            samples, concatenated.
+    """
 
     gain: float | Tensor
     power: float = 1.0
@@ -80,7 +85,17 @@ class ClassK:
         require_numbers("class_k.power", "a positive number", self.power, lambda power: power > 0)
 
     def __call__(self, h: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-        return self.gain * (h if self.power == 1 else h.sign() * h.abs() ** self.power)
+        return self._gain_of(h) * (h if self.power == 1 else h.sign() * h.abs() ** self.power)
+
+    def _gain_of(self, h: Tensor) -> float | Tensor:
+        """The gain, repeated for each of several samples of the robots, concatenated."""
+        gain = self.gain
+        if not isinstance(gain, Tensor) or gain.ndim != 2 or gain.shape[-1] != 1 or h.ndim not in (1, 2):
+            return gain
+        if len(h) % len(gain) != 0:
+            raise InputError("class_k.gain", f"one gain, or one for each of {len(h)} robots", tuple(gain.shape))
+        gain = gain.repeat(len(h) // len(gain), 1)
+        return gain if h.ndim == 2 else gain.squeeze(-1)
 
 
 @dataclass(frozen=True)
