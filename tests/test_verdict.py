@@ -221,6 +221,10 @@ def test_check_names_the_key_and_no_shift(log: Log) -> None:
     assert replace(shifted, shifts={0: smallest, -2: 0.2 * smallest}).best_shift == -2
     assert result.conclusions()[1].startswith("suspect barriers.0.safety_distance: 0.")
     assert not any("sample(s)" in line for line in result.conclusions())
+    assert result.safety is not None
+    neither = replace(result, safety=replace(result.safety, pair=False, free=None))
+    for other, is_said in ((neither, False), (replace(neither, alternative=None), True)):
+        assert any("common to all robots" in line for line in other.conclusions()) == is_said  # the cause is named once
 
 
 def test_nothing_is_suspected_of_the_right_model(log: Log) -> None:
