@@ -8,12 +8,20 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
+from tests import calls
+
 # On tensors this small torch is many times slower with more threads. They are no part of what is tested.
 torch.set_num_threads(1)
 
 # A shell's background job ignores SIGINT, and nohup SIGHUP, and both hand this down to the commands under test.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+
+@pytest.fixture(autouse=True)
+def checked_anew() -> None:
+    """Types are checked in every test."""
+    calls.clear()
 
 
 @pytest.fixture
