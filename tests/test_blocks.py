@@ -239,7 +239,7 @@ def test_wrong_blocks_are_refused() -> None:
 def test_a_bound_for_each_robot() -> None:
     """In blocks, and in the parts of a fleet, each robot has its own."""
     bounds = torch.tensor([0.01, 0.2, 0.05, 0.01], dtype=torch.float64)
-    samples = team(3, broken=False)
+    samples = team(3, broken=False)[:24]
     for noise in (NoiseBound(bounds), NoiseBound(ERROR, bounds), NoiseBound(bounds, position=RHO)):
         one_by_one, in_blocks, alone = made(noise=noise), made(noise=noise), made(noise=noise)
         fleets = [FleetObserver(alone, threads=threads) for threads in (2, 4)]
@@ -247,7 +247,7 @@ def test_a_bound_for_each_robot() -> None:
             one_by_one.update(sample)
             for fleet in fleets:
                 fleet.update(sample)
-        assert sum(len(found) for block in blocks(samples, 20) for found in in_blocks.read(block)) == SAMPLES
+        assert sum(len(found) for block in blocks(samples, 10) for found in in_blocks.read(block)) == 24
         assert_same(in_blocks, one_by_one)
         for fleet in fleets:
             assert_same_sets(fleet.feasible_set, one_by_one.feasible_set)
