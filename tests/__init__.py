@@ -19,8 +19,11 @@ strictly = cache(beartype(conf=BeartypeConf(is_pep484_tower=True)))
 def checked(function: Callable) -> Callable:
     """The function, with types that are checked when it is called. It does nothing else (`jaxtyping` made it).
 
-    The check is made when it is first needed: most test files use a small part of the package.
+    The check is made when it is first needed: most test files use a small part of the package. Functions within
+    functions are private, and would be made anew, with their checks, whenever the outer one is called.
     """
+    if "<locals>" in function.__qualname__:
+        return function
 
     @wraps(function)
     def check(*arguments: Any, **named: Any) -> None:

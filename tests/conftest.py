@@ -7,6 +7,7 @@ import jaxtyping
 import pytest
 import torch
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from tests import calls
 
@@ -37,3 +38,4 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures are laid out and drawn in seconds, which is tested elsewhere: here they are files of one byte."""
     monkeypatch.setattr(Figure, "savefig", lambda figure, file, **options: file.write(b"."))
     monkeypatch.setattr(Figure, "draw_without_rendering", lambda figure: None)
+    monkeypatch.setattr(ConstrainedLayoutEngine, "execute", lambda engine, figure: None)
