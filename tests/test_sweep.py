@@ -204,8 +204,8 @@ def test_a_sweep_leaves_the_folder_of_a_run_alone(config: Path, tmp_path: Path, 
 def test_the_journal_keeps_every_whole_line(tmp_path: Path):
     path = tmp_path / "records.jsonl"
     with Journal(path) as journal:
-        journal.add({"run": 3, "row": {"a": 1}})
-        journal.add({"run": 1, "row": {"a": 2}})
+        journal.add([{"run": 3, "row": {"a": 1}}])
+        journal.add([{"run": 1, "row": {"a": 2}}])
     whole = path.read_bytes()
     for broken in (b"", b"{", b'{"run": 2, "row": {}}', b"\0\0\0"):
         path.write_bytes(whole + broken)
@@ -214,7 +214,7 @@ def test_the_journal_keeps_every_whole_line(tmp_path: Path):
             assert path.read_bytes() == whole
     path.write_bytes(b"\0\0\n" + whole)
     with Journal(path) as journal:
-        journal.add({"run": 0, "row": {}})
+        journal.add([{"run": 0, "row": {}}])
     with Journal(path) as journal:
         assert journal.records.keys() == {0, 1, 3}
 

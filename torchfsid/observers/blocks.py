@@ -35,15 +35,16 @@ FEW = 12
 """Batches of sets that are joined at a time."""
 
 
-def depends_on_theta(model: ObservationModel, measurement: Measurement) -> bool:
-    """Does what a measurement says depend on the sets so far?
+def depends_on_theta(model: ObservationModel, measurement: Measurement, robots: int) -> bool:
+    """Does what a measurement of these robots says, at one or several times, depend on the sets so far?
 
     A bound on the drift of C theta + d is no smaller for larger theta. If it is the same for theta = 0 as for all theta
     of the largest numbers, it does not depend on theta.
     """
     if model.task.saturation is not None or getattr(model.task, "uncertain", False):
         return True
-    noise = model.noise and replace(model.noise, velocity=0.0, slack=0.0)  # no drift depends on them
+    noise = model.noise and model.noise.of_samples(robots, len(measurement.x))
+    noise = noise and replace(noise, velocity=0.0, slack=0.0)  # no drift depends on them
     errors = ErrorBounds.of(measurement, noise)
     if errors is None:
         return False
