@@ -1,9 +1,9 @@
 """Several samples of all robots, taken in at once: what does not depend on Theta is computed for all of them.
 
 The half-spaces of S samples are given. Most of them cut no set. Theta of a robot changes at some samples only, and a
-search finds the next of these for each robot (`kernels.first_cuts`; the support function in other dimensions). All
-robots are then cut together, each by the half-spaces of its own next sample, and the search goes on from there. So sets
-are cut in the order of time, exactly as if the samples had come one by one.
+search finds the next of these for each robot (`kernels.first_cuts`). All robots are then cut together, each by the
+half-spaces of its own next sample, and the search goes on from there. So sets are cut in the order of time, exactly as
+if the samples had come one by one.
 """
 
 from __future__ import annotations
@@ -19,13 +19,11 @@ from torch import Tensor
 
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, array
-from torchfsid.identification.by_robot import by_robot
 from torchfsid.identification.evidence import ObservationModel
-from torchfsid.kernels.first_cuts import first_cuts
+from torchfsid.kernels.first_cuts import first_cuts, first_cuts_of_hulls
 from torchfsid.observers.outliers import Levels, narrowed
 from torchfsid.robots.bounds import ErrorBounds
 from torchfsid.robots.measurement import Measurement
-from torchfsid.sets.around import reach
 from torchfsid.sets.feasible_set import FeasibleSet
 
 LARGEST_THETA = 1e9
@@ -163,14 +161,12 @@ class Course:
         return found
 
     def _next_cut_of(self, level: FeasibleSet, start: Int[Tensor, "B"]) -> Int[Tensor, "B"]:
-        samples, robots = len(self.t), len(start)
+        corners, reach = array(level.body.corners), array(level.body.reach)
         if level.dim == 2:
-            polygons = map(array, (level.body.corners, level.body.count, level.body.reach))
-            return torch.from_numpy(first_cuts(*polygons, *self._rows, array(start))).to(start.device)
-        rows, _ = by_robot(self.omega, 0.0, robots)
-        cuts = (reach(rows, level) > rows.b).unflatten(-1, (samples, -1)).any(-1)
-        cuts = cuts & (torch.arange(samples, device=start.device) >= start.unsqueeze(-1))
-        return torch.where(cuts.any(-1), cuts.int().argmax(-1), samples)
+            found = first_cuts(corners, array(level.body.count), reach, *self._rows, array(start))
+        else:
+            found = first_cuts_of_hulls(corners, reach, *self._rows, array(start))
+        return torch.from_numpy(found).to(start.device)
 
     @cached_property
     def _rows(self) -> tuple[np.ndarray, np.ndarray]:
