@@ -120,10 +120,8 @@ class Batch:
 
         One sample (teams, slots) is allowed, too.
         """
-        shape = samples.x.shape[:-1]
-        flat = replace(samples, **{name: value.flatten(0, len(shape) - 1) for name, value in _tensors(samples)})
-        first = torch.arange(0, shape.numel(), self.robots * len(self.scenes))
-        return flat.select((first.unsqueeze(-1) + self.places).flatten())
+        first = torch.arange(0, samples.x.shape[:-1].numel(), self.robots * len(self.scenes))
+        return samples.flattened().select((first.unsqueeze(-1) + self.places).flatten())
 
     def _padded(
         self, points: Callable[[SceneConfig], Sequence[tuple[float, ...]]]
@@ -136,11 +134,6 @@ class Batch:
             there[i, : len(found)] = True
             padded[i, : len(found)] = torch.tensor(found, dtype=torch.float64).reshape(len(found), padded.shape[-1])
         return padded, there
-
-
-def _tensors(measurement: Measurement) -> list[tuple[str, Tensor]]:
-    values = ((field.name, getattr(measurement, field.name)) for field in fields(measurement))
-    return [(name, value) for name, value in values if isinstance(value, Tensor)]
 
 
 def _joined(of_scenes: Sequence[Any], of: Int[Tensor, "*batch"]) -> Any:

@@ -32,7 +32,7 @@ def measure(batch: Batch) -> Trajectory:
     if batch.scenes[0].measurement_noise.shape == "adversarial":
         return _worst(batch, generators)
     x, u, velocity = true.x.clone(), true.u.clone(), None if true.velocity is None else true.velocity.clone()
-    (inside, surface) = (in_disc, _on_circle) if x.shape[-1] == 2 else (_in_ball, _on_sphere)
+    (inside, surface) = (in_disc, on_circle) if x.shape[-1] == 2 else (_in_ball, _on_sphere)
     for i, (scene, random) in enumerate(zip(batch.scenes, generators, strict=True)):
         noise, robots = scene.measurement_noise, len(scene.robots)
         draw, shape = (inside, (len(true.t), robots)) if noise.shape == "uniform" else (surface, (robots,))
@@ -58,8 +58,8 @@ def _worst(batch: Batch, generators: Sequence[np.random.Generator]) -> Trajector
     measured = replace(true, x=true.x.clone(), u=true.u.clone())
     for i, (noise, random) in enumerate(zip(noises, generators, strict=True)):
         count = (int((team == i).sum()),)
-        measured.x[0, i, : count[0]] += _on_circle(random, noise.position, count)
-        measured.u[0, i, : count[0]] += _on_circle(random, noise.velocity, count)
+        measured.x[0, i, : count[0]] += on_circle(random, noise.position, count)
+        measured.u[0, i, : count[0]] += on_circle(random, noise.velocity, count)
     for k in range(len(true.t)):
         if k > 0:  # until they are chosen, the errors are those of one sample before
             for seen, exact in ((measured.x, true.x), (measured.u, true.u)):
@@ -88,7 +88,8 @@ def in_disc(random: np.random.Generator, radius: float, shape: tuple[int, ...]) 
     return torch.from_numpy(np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=-1))
 
 
-def _on_circle(random: np.random.Generator, radius: float, shape: tuple[int, ...]) -> Float[Tensor, "*shape 2"]:
+def on_circle(random: np.random.Generator, radius: float, shape: tuple[int, ...]) -> Float[Tensor, "*shape 2"]:
+    """Points uniformly distributed on a circle."""
     return radius * _towards(torch.from_numpy(random.uniform(0, 2 * np.pi, size=shape)))
 
 
