@@ -3,7 +3,8 @@
 `experiment` is a scene (`experiments.runs.config`) without what the sweep fills in: `title`, `seed`, `snapshots`, and
 with a `team`, `robots` and `obstacles`. Every point of the grid is run `repeats` times. Run i draws all its random
 numbers from child i of one `numpy.random.SeedSequence`. So it is the same run in any order, on any number of workers.
-This module does not import torch.
+The filter is the compiled one where it can be used, unless `ukf.engine` says otherwise. This module does not import
+torch.
 """
 
 from __future__ import annotations
