@@ -14,6 +14,7 @@ from torch import Tensor
 
 from tests.hard_sets import hard_sets, padded
 from torchfsid import ChebyshevCentre, Halfspaces, ProjectOnto
+from torchfsid.kernels.active_rows import simplex_around
 from torchfsid.outcome import Status
 from torchfsid.programmes import exact, rational
 
@@ -103,7 +104,7 @@ def test_the_rational_programmes_say_the_same(p):
         conditions(own, bounds, y[i], point, every)
         assert np.linalg.norm(point - y[i]) == pytest.approx(np.linalg.norm(z[i] - y[i]), rel=1e-9)
         centre, touching = np.zeros(p), np.zeros(p + 1, dtype=np.int64)
-        r, status = rational.inscribed_ball(own, bounds, exact.simplex_around(p), centre, touching)
+        r, status = rational.inscribed_ball(own, bounds, simplex_around(p), centre, touching)
         assert status == Status.OK
         lengths = np.linalg.norm(own, axis=1)
         room = ROUND_OFF * (np.abs(bounds / lengths).max() + np.abs(centre).sum())

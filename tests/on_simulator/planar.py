@@ -1,20 +1,15 @@
-"""Tests for a process with NUMBA_ENABLE_CUDASIM=1, see `tests.test_cuda`: there, tensors stand for those on a device.
-
-The simulator runs the kernels' Python source, and the other side is the same source compiled for the CPU. So the
-numbers are the same to the last bit, but for libm's functions of angles.
-"""
+"""Polygons and evidence. A test for a process with NUMBA_ENABLE_CUDASIM=1, see `tests.test_cuda` and `_both`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from tests import test_evidence_kernel as scenes
+from tests.on_simulator._both import SIZES, both, launched, same
 from tests.problems import CASES, paper_case, random_scene
 from torchfsid import device
 from torchfsid.halfspaces import Halfspaces
@@ -30,31 +25,6 @@ from torchfsid.robots.tasks import GoalTask, Saturation
 from torchfsid.sets.feasible_set import FeasibleSet
 
 pytestmark = pytest.mark.filterwarnings("ignore:divide by zero")  # in Python, a row 0.z <= -1 is noticed
-
-SIZES = [1, 7, 65]
-"""Batches of one item, of a part of a block of threads, and of one item more than a block."""
-
-
-def both(function: Callable[[], Any]) -> tuple[Any, Any]:
-    """What a function returns with the kernels for the CPU, and with those for a device."""
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(device, "SIMULATED", False)
-        on_cpu = function()
-    return on_cpu, function()
-
-
-@pytest.fixture(autouse=True)
-def launched(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
-    """The names of the kernels that a test has launched: there must be some."""
-    names: list[str] = []
-    real = device.launch
-    monkeypatch.setattr(device, "launch", lambda name, *others: (names.append(name), real(name, *others)))
-    yield names
-    assert names
-
-
-def same(one: torch.Tensor, other: torch.Tensor) -> None:
-    torch.testing.assert_close(one, other, rtol=0, atol=0, equal_nan=True)
 
 
 def same_sets(one: FeasibleSet, other: FeasibleSet) -> None:

@@ -25,6 +25,7 @@ for floating point, 0 for exact rationals. For rationals the same functions are 
 
 from __future__ import annotations
 
+from functools import cache
 from typing import no_type_check
 
 import numpy as np
@@ -143,6 +144,13 @@ def nearest_rows(A, b, sizes, epsilon, rows, Q, D, T, work, z):
         else:
             break
     return k, UNSOLVED
+
+
+@cache
+def simplex_around(p: int) -> np.ndarray:
+    """Rows (a, 1) with the unit outward normals a of the p + 1 sides of a simplex."""
+    normals = np.concatenate([-np.eye(p), np.full((1, p), p**-0.5)])
+    return np.column_stack([normals, np.ones(p + 1)])
 
 
 @item

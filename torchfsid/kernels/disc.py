@@ -88,6 +88,26 @@ def _touching(rows, right, basis, weight):
     return x, y, r, max(scale, abs(x) + abs(y) + abs(r))
 
 
+@item
+@no_type_check
+def disc_one(k, vertices, A, b, count, scratch, centre, radius, basis, found):
+    """A largest disc of polygon k, see `inscribed`. Scratch: (V, 2), (V,), (3,), (3,)."""
+    rows, right, weight, turned = scratch
+    n, x, y = count[k], 0.0, 0.0
+    for i in range(n):  # relative to a point of the set, so that small sets far from the origin lose no digits
+        x += vertices[k, i, 0] / n
+        y += vertices[k, i, 1] / n
+    for i in range(n):
+        norm = math.sqrt(A[k, i, 0] ** 2 + A[k, i, 1] ** 2)
+        if not 1e-150 < norm < 1e150:  # the squares have lost digits
+            norm = math.hypot(A[k, i, 0], A[k, i, 1])
+        rows[i, 0], rows[i, 1] = A[k, i, 0] / norm, A[k, i, 1] / norm
+        right[i] = (b[k, i] - A[k, i, 0] * x - A[k, i, 1] * y) / norm
+    step_x, step_y, r, found[k] = inscribed_in(rows, right, n, basis[k], weight, turned)
+    radius[k] = max(r, 0.0)  # that of a flat set may be negative by round-off
+    centre[k, 0], centre[k, 1] = x + step_x, y + step_y
+
+
 @launcher
 @no_type_check
 def inscribed(vertices, A, b, count):
@@ -104,19 +124,7 @@ def inscribed(vertices, A, b, count):
     """
     B, V = b.shape
     basis, centre, radius, found = np.zeros((B, 3), np.int64), np.zeros((B, 2)), np.zeros(B), np.zeros(B, np.bool_)
-    rows, right, weight, turned = np.empty((V, 2)), np.empty(V), np.empty(3), np.empty(3)
+    scratch = np.empty((V, 2)), np.empty(V), np.empty(3), np.empty(3)
     for k in range(B):
-        n, x, y = count[k], 0.0, 0.0
-        for i in range(n):  # relative to a point of the set, so that small sets far from the origin lose no digits
-            x += vertices[k, i, 0] / n
-            y += vertices[k, i, 1] / n
-        for i in range(n):
-            norm = math.sqrt(A[k, i, 0] ** 2 + A[k, i, 1] ** 2)
-            if not 1e-150 < norm < 1e150:  # the squares have lost digits
-                norm = math.hypot(A[k, i, 0], A[k, i, 1])
-            rows[i, 0], rows[i, 1] = A[k, i, 0] / norm, A[k, i, 1] / norm
-            right[i] = (b[k, i] - A[k, i, 0] * x - A[k, i, 1] * y) / norm
-        step_x, step_y, r, found[k] = inscribed_in(rows, right, n, basis[k], weight, turned)
-        radius[k] = max(r, 0.0)  # that of a flat set may be negative by round-off
-        centre[k, 0], centre[k, 1] = x + step_x, y + step_y
+        disc_one(k, vertices, A, b, count, scratch, centre, radius, basis, found)
     return centre, radius, basis, found

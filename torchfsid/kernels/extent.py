@@ -55,13 +55,40 @@ def outside_by(A, b, z):
     return most
 
 
+@item
+@no_type_check
+def farthest_one(i, vertices, ends, distance):
+    """The two farthest vertices of set i, see `farthest`."""
+    ends[i, 0], ends[i, 1], distance[i] = farthest_apart(vertices[i])
+
+
+@item
+@no_type_check
+def contains_one(i, vertices, A, b, reach, points, tolerance, inside):
+    """Whether points are in set i, see `contains`."""
+    K, p = points.shape[1], points.shape[2]
+    diameter, size = -1.0, 0.0
+    for j in range(p):
+        size += 2.0 * reach[i, j]
+    for k in range(K):
+        largest = 0.0
+        for j in range(p):
+            largest = max(largest, abs(points[i, k, j]))
+        over, margin = outside_by(A[i], b[i], points[i, k]), ROUND_OFF * (largest + size)
+        if over > margin:
+            if diameter < 0.0:
+                _, _, diameter = farthest_apart(vertices[i])
+            margin += tolerance * diameter
+        inside[i, k] = over <= margin
+
+
 @launcher
 @no_type_check
 def farthest(vertices):
     """The numbers (B, 2) of the two farthest vertices of each set and their distance (B,), from vertices (B, V, p)."""
     ends, distance = np.empty((len(vertices), 2), np.int64), np.empty(len(vertices))
     for i in range(len(vertices)):
-        ends[i, 0], ends[i, 1], distance[i] = farthest_apart(vertices[i])
+        farthest_one(i, vertices, ends, distance)
     return ends, distance
 
 
@@ -75,26 +102,13 @@ def contains(vertices, A, b, reach, points, tolerance):
         A: (B, F, p), the rows of the sets.
         b: (B, F), their bounds.
         reach: (B, p), the largest |coordinates| that the set ever had.
-        points: (K, B, p), K points for each set.
+        points: (B, K, p), K points for each set.
         tolerance: the share of the diameter.
 
     Returns:
-        A mask (K, B).
+        (inside,): a mask (B, K).
     """
-    K, B, p = points.shape
-    inside = np.empty((K, B), np.bool_)
-    for i in range(B):
-        diameter, size = -1.0, 0.0
-        for j in range(p):
-            size += 2.0 * reach[i, j]
-        for k in range(K):
-            largest = 0.0
-            for j in range(p):
-                largest = max(largest, abs(points[k, i, j]))
-            over, margin = outside_by(A[i], b[i], points[k, i]), ROUND_OFF * (largest + size)
-            if over > margin:
-                if diameter < 0.0:
-                    _, _, diameter = farthest_apart(vertices[i])
-                margin += tolerance * diameter
-            inside[k, i] = over <= margin
-    return inside
+    inside = np.empty(points.shape[:2], np.bool_)
+    for i in range(len(inside)):
+        contains_one(i, vertices, A, b, reach, points, tolerance, inside)
+    return (inside,)

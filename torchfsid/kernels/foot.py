@@ -41,6 +41,15 @@ def foot_on(vertices, A, b, n, x, y, metric):
     return foot_x, foot_y, first, second
 
 
+@item
+@no_type_check
+def foot_one(k, vertices, A, b, count, point, metric, foot, active):
+    """The nearest point of polygon k, see `feet`."""
+    foot[k, 0], foot[k, 1], active[k, 0], active[k, 1] = foot_on(
+        vertices[k], A[k], b[k], count[k], point[k, 0], point[k, 1], metric[k]
+    )
+
+
 @launcher
 @no_type_check
 def feet(vertices, A, b, count, point, metric):
@@ -60,7 +69,5 @@ def feet(vertices, A, b, count, point, metric):
     """
     foot, active = np.empty((len(count), 2)), np.empty((len(count), 2), np.int64)
     for k in range(len(count)):
-        foot[k, 0], foot[k, 1], active[k, 0], active[k, 1] = foot_on(
-            vertices[k], A[k], b[k], count[k], point[k, 0], point[k, 1], metric[k]
-        )
+        foot_one(k, vertices, A, b, count, point, metric, foot, active)
     return foot, active

@@ -99,7 +99,7 @@ def to_frame(A, b, y, L, metric, unit, offsets, sizes, lengths):
         A: (m, p), the rows.
         b: (m,), their bounds.
         y: (p,), the point.
-        L: (p, p), the Cholesky factor of the metric.
+        L: (p, p), the Cholesky factor of the metric; not read without a `metric`.
         metric: whether there is a metric; without one it is the identity.
         unit: (m, p), to be filled with unit rows, 0 for zero rows.
         offsets: (m,), to be filled with bounds, infinite for zero rows.

@@ -31,7 +31,7 @@ def solve_given(N, k, pull, offsets, L, metric, rows, Q, D, T, work, z, mu):
         k: the number of rows that are used.
         pull: (p,), the right-hand side of stationarity.
         offsets: (k or more,), the bounds.
-        L: (p, p), the Cholesky factor of H = L L'.
+        L: (p, p), the Cholesky factor of H = L L'; not read without a `metric`.
         metric: whether there is a metric; without one, H is the identity.
         rows: scratch.
         Q: scratch.
@@ -60,82 +60,119 @@ def solve_given(N, k, pull, offsets, L, metric, rows, Q, D, T, work, z, mu):
         mu[s] *= scale_of(N, s)
 
 
+@item
+@no_type_check
+def solve_one(i, N, filled, pull, offsets, H, metric, scratch, z, mu):
+    """Solve H z + N' mu = pull, N z = offsets for item i, with the n rows of N that are `filled`, its first ones.
+
+    The results z and mu are filled, mu at these rows. H is not read without a `metric`, and z is NaN if H[i] is not
+    positive definite.
+
+    Scratch: L: (p, p), Q, rows: (n, p) each, T: (n, n), D: (n,), work: (6, max(n, p)).
+    """
+    L, Q, rows, T, D, work = scratch
+    k = 0
+    while k < N.shape[1] and filled[i, k]:
+        k += 1
+    if metric and not cholesky(H[i], L):
+        for j in range(z.shape[1]):
+            z[i, j] = np.nan
+    else:
+        solve_given(N[i], k, pull[i], offsets[i], L, metric, rows, Q, D, T, work, z[i], mu[i])
+
+
 @launcher
 @no_type_check
 def solve_active(N, filled, pull, offsets, H, z, mu):
-    """Solve H z + N' mu = pull, N z = offsets for each item, with the rows of N that are `filled`, its first ones.
+    """Solve H z + N' mu = pull, N z = offsets for each item, see `solve_one`.
 
-    H is (B, p, p), or (0, p, p) for the identity. The results z and mu are filled.
+    H is (B, p, p), or (0, p, p) for the identity.
     """
     B, n, p = N.shape
-    metric = len(H) > 0
-    L, Q, T, rows = np.zeros((p, p)), np.zeros((n, p)), np.zeros((n, n)), np.zeros((n, p))
-    D, work = np.zeros(n), np.zeros((6, max(n, p)))
+    L, Q, rows, T = np.zeros((p, p)), np.zeros((n, p)), np.zeros((n, p)), np.zeros((n, n))
+    scratch = L, Q, rows, T, np.zeros(n), np.zeros((6, max(n, p)))
     for i in range(B):
-        k = 0
-        while k < n and filled[i, k]:
-            k += 1
-        if metric and not cholesky(H[i], L):
-            for j in range(p):
-                z[i, j] = np.nan
-        else:
-            solve_given(N[i], k, pull[i], offsets[i], L, metric, rows, Q, D, T, work, z[i], mu[i])
+        solve_one(i, N, filled, pull, offsets, H, len(H) > 0, scratch, z, mu)
+
+
+@item
+@no_type_check
+def nearest_vjp_one(i, A, rows, filled, mu, z, status, grad_z, grad_mu, scratch, grad_A, grad_b, grad_y):
+    """The vector-Jacobian products of the Euclidean nearest point of item i.
+
+    They are added to `grad_A`, `grad_b` and `grad_y`, which have to be zero before.
+
+    Scratch: Q, T, N, scaled: (p, p) each, D, u, v: (p,) each, work: (6, p).
+    """
+    if status[i] != OK:
+        return
+    Q, T, N, scaled, D, u, v, work = scratch
+    p, k = z.shape[1], 0
+    while k < p and filled[i, k]:
+        for j in range(p):
+            N[k, j] = A[i, rows[i, k], j]
+        k += 1
+    solve_given(N, k, grad_z[i], grad_mu[i], N, False, scaled, Q, D, T, work, u, v)
+    for j in range(p):
+        grad_y[i, j] = u[j]
+    for s in range(k):
+        grad_b[i, rows[i, s]] += v[s]
+        for j in range(p):
+            grad_A[i, rows[i, s], j] -= mu[i, s] * u[j] + v[s] * z[i, j]
 
 
 @launcher
 @no_type_check
 def nearest_point_vjp(A, rows, filled, mu, z, status, grad_z, grad_mu, grad_A, grad_b, grad_y):
-    """The vector-Jacobian products of the Euclidean nearest point.
-
-    They are added to `grad_A`, `grad_b` and `grad_y`, which have to be zero before.
-    """
+    """The vector-Jacobian products of the Euclidean nearest point of each item, see `nearest_vjp_one`."""
     B, p = z.shape
-    L, Q, T, N, scaled = np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p))
-    D, work, u, v = np.zeros(p), np.zeros((6, p)), np.zeros(p), np.zeros(p)
+    Q, T, N, scaled = np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p))
+    scratch = Q, T, N, scaled, np.zeros(p), np.zeros(p), np.zeros(p), np.zeros((6, p))
     for i in range(B):
-        if status[i] != OK:
-            continue
-        k = 0
-        while k < p and filled[i, k]:
-            for j in range(p):
-                N[k, j] = A[i, rows[i, k], j]
-            k += 1
-        solve_given(N, k, grad_z[i], grad_mu[i], L, False, scaled, Q, D, T, work, u, v)
+        nearest_vjp_one(i, A, rows, filled, mu, z, status, grad_z, grad_mu, scratch, grad_A, grad_b, grad_y)
+
+
+@item
+@no_type_check
+def ball_vjp_one(i, A, centre, radius, rows, simplex, grad_centre, grad_radius, scratch, grad_A, grad_b):
+    """The vector-Jacobian products of the largest ball of item i, n = p + 1.
+
+    They are added to `grad_A` and `grad_b`, which have to be zero before.
+
+    Scratch: Q, T, N, scaled: (n, n) each, D, u, v, pull, nothing: (n,) each, work: (6, n).
+    """
+    if not math.isfinite(radius[i]):
+        return
+    Q, T, N, scaled, D, u, v, pull, nothing, work = scratch
+    m, p = A.shape[1], A.shape[2]
+    has_centre = math.isfinite(centre[i, 0])
+    for s in range(p + 1):
+        real = rows[i, s] < m
+        scale, square = scale_of(A[i], rows[i, s]) if real else 1.0, 0.0
         for j in range(p):
-            grad_y[i, j] = u[j]
-        for s in range(k):
+            N[s, j] = A[i, rows[i, s], j] if real else simplex[rows[i, s] - m, j]
+            square += (N[s, j] * scale) ** 2
+        N[s, p] = math.sqrt(square) / scale
+        nothing[s] = 0.0
+    for j in range(p):
+        pull[j] = grad_centre[i, j] if has_centre else 0.0
+    pull[p] = grad_radius[i]
+    solve_given(N, p + 1, pull, nothing, N, False, scaled, Q, D, T, work, u, v)
+    for s in range(p + 1):
+        if rows[i, s] < m:
             grad_b[i, rows[i, s]] += v[s]
             for j in range(p):
-                grad_A[i, rows[i, s], j] -= mu[i, s] * u[j] + v[s] * z[i, j]
+                at = centre[i, j] if has_centre else 0.0
+                grad_A[i, rows[i, s], j] -= v[s] * (at + radius[i] * (N[s, j] / N[s, p]))
 
 
 @launcher
 @no_type_check
 def inscribed_ball_vjp(A, centre, radius, rows, simplex, grad_centre, grad_radius, grad_A, grad_b):
-    """The vector-Jacobian products of the largest ball. They are added to `grad_A` and `grad_b`, zero before."""
-    B, m, p = A.shape
-    n = p + 1
-    L, Q, T, N, scaled = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
-    D, work, nothing, v, u = np.zeros(n), np.zeros((6, n)), np.zeros(n), np.zeros(n), np.zeros(n)
-    pull = np.zeros(n)
-    for i in range(B):
-        if not math.isfinite(radius[i]):
-            continue
-        has_centre = math.isfinite(centre[i, 0])
-        for s in range(n):
-            real = rows[i, s] < m
-            scale, square = scale_of(A[i], rows[i, s]) if real else 1.0, 0.0
-            for j in range(p):
-                N[s, j] = A[i, rows[i, s], j] if real else simplex[rows[i, s] - m, j]
-                square += (N[s, j] * scale) ** 2
-            N[s, p] = math.sqrt(square) / scale
-        for j in range(p):
-            pull[j] = grad_centre[i, j] if has_centre else 0.0
-        pull[p] = grad_radius[i]
-        solve_given(N, n, pull, nothing, L, False, scaled, Q, D, T, work, u, v)
-        for s in range(n):
-            if rows[i, s] < m:
-                grad_b[i, rows[i, s]] += v[s]
-                for j in range(p):
-                    at = centre[i, j] if has_centre else 0.0
-                    grad_A[i, rows[i, s], j] -= v[s] * (at + radius[i] * (N[s, j] / N[s, p]))
+    """The vector-Jacobian products of the largest ball of each item, see `ball_vjp_one`."""
+    n = A.shape[2] + 1
+    Q, T, N, scaled = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
+    D, u, v, pull, nothing = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    scratch = Q, T, N, scaled, D, u, v, pull, nothing, np.zeros((6, n))
+    for i in range(len(A)):
+        ball_vjp_one(i, A, centre, radius, rows, simplex, grad_centre, grad_radius, scratch, grad_A, grad_b)

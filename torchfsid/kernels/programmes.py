@@ -81,38 +81,58 @@ def finish_nearest(A, b, y, L, metric, unit, sizes, lengths, rows, k, Q, D, T, w
     return OK if verified else UNSOLVED
 
 
+@item
+@no_type_check
+def nearest_one(i, A, b, y, H, metric, frame, scratch, z, mu, rows, filled, status):
+    """The nearest point of item i, in the metric H[i] if there is a `metric`.
+
+    Args:
+        i: the item.
+        A: (B, m, p), the rows.
+        b: (B, m), their bounds.
+        y: (B, p), the points.
+        H: (B, p, p), the metrics; not read without a `metric`.
+        metric: whether there is a metric; without one it is the identity.
+        frame: scratch for the rows in the frame: (m, p), (m,), (m,), (m, 2).
+        scratch: L, Q, T, N: (p, p) each, D: (p,), work: (6, p), x: (p,).
+        z: (B, p), filled with the point, NaN if there is none.
+        mu: (B, p), filled with the multipliers.
+        rows: (B, p), filled with the active rows.
+        filled: (B, p), filled with a mask of the places in `rows` that hold one.
+        status: (B,), filled with the status.
+    """
+    unit, offsets, sizes, lengths = frame
+    L, Q, T, N, D, work, x = scratch
+    state, k = OK, 0
+    if metric and not cholesky(H[i], L):
+        state = UNDEFINED
+    else:
+        state = to_frame(A[i], b[i], y[i], L, metric, unit, offsets, sizes, lengths)
+    if state == OK:
+        k, state = nearest_rows(unit, offsets, sizes, ROUND_OFF, rows[i], Q, D, T, work, x)
+    if state == OK:
+        state = finish_nearest(
+            A[i], b[i], y[i], L, metric, unit, sizes, lengths, rows[i], k, Q, D, T, work, N, x, z[i], mu[i]
+        )
+    status[i] = state
+    for s in range(z.shape[1]):
+        filled[i, s] = state == OK and s < k
+        if not filled[i, s]:
+            mu[i, s], rows[i, s] = 0.0, 0
+        if state != OK:
+            z[i, s] = np.nan
+
+
 @launcher
 @no_type_check
 def nearest_point(A, b, y, H, z, mu, rows, filled, status):
-    """The nearest point of each item. Fills `z`, `mu`, `rows`, `filled` and `status`.
-
-    H is (B, p, p), or (0, p, p) for the identity.
-    """
+    """The nearest point of each item, see `nearest_one`. H is (B, p, p), or (0, p, p) for the identity."""
     B, m, p = A.shape
-    metric = len(H) > 0
-    unit, offsets, sizes, lengths = np.empty((m, p)), np.empty(m), np.empty(m), np.empty((m, 2))
+    frame = np.empty((m, p)), np.empty(m), np.empty(m), np.empty((m, 2))
     L, Q, T, N = np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p))
-    D, work, x = np.zeros(p), np.zeros((6, p)), np.zeros(p)
+    scratch = L, Q, T, N, np.zeros(p), np.zeros((6, p)), np.zeros(p)
     for i in range(B):
-        state = OK
-        if metric and not cholesky(H[i], L):
-            state = UNDEFINED
-        else:
-            state = to_frame(A[i], b[i], y[i], L, metric, unit, offsets, sizes, lengths)
-        k = 0
-        if state == OK:
-            k, state = nearest_rows(unit, offsets, sizes, ROUND_OFF, rows[i], Q, D, T, work, x)
-        if state == OK:
-            state = finish_nearest(
-                A[i], b[i], y[i], L, metric, unit, sizes, lengths, rows[i], k, Q, D, T, work, N, x, z[i], mu[i]
-            )
-        status[i] = state
-        for s in range(p):
-            filled[i, s] = state == OK and s < k
-            if not filled[i, s]:
-                mu[i, s], rows[i, s] = 0.0, 0
-            if state != OK:
-                z[i, s] = np.nan
+        nearest_one(i, A, b, y, H, len(H) > 0, frame, scratch, z, mu, rows, filled, status)
 
 
 @item
@@ -224,27 +244,49 @@ def write_ball(w, m, status, centre, rows):
     return radius, status
 
 
+@item
+@no_type_check
+def ball_one(i, A, b, simplex, frame, scratch, centre, radius, rows, status):
+    """The largest ball of item i, n = p + 1.
+
+    Args:
+        i: the item.
+        A: (B, m, p), the rows.
+        b: (B, m), their bounds.
+        simplex: (n, n), see `inscribed_rows`.
+        frame: scratch for the rows in the frame: (m, n), (m,), (m,), (m, 2).
+        scratch: M, V, Q, T: (n, n) each, D: (n,), search: (5, n), work: (6, n), able: (n,) of booleans.
+        centre: (B, p), filled with the centre.
+        radius: (B,), filled with the radius.
+        rows: (B, n), filled with the rows that decide them.
+        status: (B,), filled with the status.
+    """
+    unit, offsets, sizes, lengths = frame
+    M, V, Q, T, D, search, work, able = scratch
+    m, p = A.shape[1], A.shape[2]
+    origin, w, far = work[0], search[2], search[3]
+    for j in range(p + 1):
+        origin[j] = 0.0
+    for r in range(m):
+        unit[r, p] = 1.0
+    state = to_frame(A[i], b[i], origin[:p], M, False, unit[:, :p], offsets, sizes, lengths)
+    if state == EMPTY:
+        state = IMPOSSIBLE
+    elif state == OK:
+        state = UNSOLVED
+        if inscribed_rows(unit, offsets, simplex, ROUND_OFF, rows[i], M, V, search, able):
+            state = finish_ball(unit, offsets, simplex, rows[i], V, w, far, M, Q, D, T, work)
+    radius[i], status[i] = write_ball(w, m, state, centre[i], rows[i])
+
+
 @launcher
 @no_type_check
 def inscribed_ball(A, b, simplex, centre, radius, rows, status):
-    """The largest ball of each item. Fills `centre`, `radius`, `rows` and `status`."""
+    """The largest ball of each item, see `ball_one`."""
     B, m, p = A.shape
-    unit, offsets, sizes, lengths = np.ones((m, p + 1)), np.empty(m), np.empty(m), np.empty((m, 2))
-    M, V, work, able = (
-        np.zeros((p + 1, p + 1)),
-        np.zeros((p + 1, p + 1)),
-        np.zeros((5, p + 1)),
-        np.zeros(p + 1, np.bool_),
-    )
-    origin, L = np.zeros(p), np.zeros((p, p))
-    Q, D, T, scratch = np.zeros((p + 1, p + 1)), np.zeros(p + 1), np.zeros((p + 1, p + 1)), np.zeros((6, p + 1))
-    w, far = work[2], work[3]
+    n = p + 1
+    frame = np.empty((m, n)), np.empty(m), np.empty(m), np.empty((m, 2))
+    M, V, Q, T = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
+    scratch = M, V, Q, T, np.zeros(n), np.zeros((5, n)), np.zeros((6, n)), np.zeros(n, np.bool_)
     for i in range(B):
-        state = to_frame(A[i], b[i], origin, L, False, unit[:, :p], offsets, sizes, lengths)
-        if state == EMPTY:
-            state = IMPOSSIBLE
-        elif state == OK:
-            state = UNSOLVED
-            if inscribed_rows(unit, offsets, simplex, ROUND_OFF, rows[i], M, V, work, able):
-                state = finish_ball(unit, offsets, simplex, rows[i], V, w, far, M, Q, D, T, scratch)
-        radius[i], status[i] = write_ball(w, m, state, centre[i], rows[i])
+        ball_one(i, A, b, simplex, frame, scratch, centre, radius, rows, status)

@@ -19,16 +19,16 @@ from collections.abc import Callable
 from inspect import signature
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, lengths
+from torchfsid.kernels.active_rows import simplex_around
 from torchfsid.outcome import Status
 from torchfsid.programmes import exact
-from torchfsid.programmes.exact import simplex_around
+from torchfsid.programmes.on_tensors import on_items
 
 
 class NearestPoint(NamedTuple):
@@ -148,7 +148,7 @@ class _NearestPoint(torch.autograd.Function):
     @staticmethod
     @_signed
     def forward(A: Tensor, b: Tensor, y: Tensor, metric: Tensor | None) -> tuple[Tensor, ...]:
-        return on_arrays(exact.nearest_point, *((A, b, y) if metric is None else (A, b, y, metric)))
+        return on_items(exact.nearest_point, *((A, b, y) if metric is None else (A, b, y, metric)))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
@@ -162,7 +162,7 @@ class _NearestPoint(torch.autograd.Function):
         A, y, metric, z, mu, rows, filled, status = ctx.saved_tensors
         if metric is None and _first_derivatives_suffice():
             saved = A, rows, filled, mu, z, status
-            return *on_arrays(exact.nearest_point_vjp, *saved, grad_z, grad_mu), None
+            return *on_items(exact.nearest_point_vjp, *saved, grad_z, grad_mu), None
         ok = status.unsqueeze(-1) == Status.OK
         z, metric = torch.where(ok, z, 0.0), _definite(metric, ok)
         N, index = _taken(A, rows)
@@ -210,7 +210,7 @@ class _SolveActive(torch.autograd.Function):
         N: Tensor, filled: Tensor, pull: Tensor, offsets: Tensor, metric: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         tensors = (N, filled, pull, offsets) if metric is None else (N, filled, pull, offsets, metric)
-        z, mu = on_arrays(exact.solve_active, *tensors)
+        z, mu = on_items(exact.solve_active, *tensors)
         return z, mu
 
     @staticmethod
@@ -247,7 +247,7 @@ class _InscribedBall(torch.autograd.Function):
     @staticmethod
     @_signed
     def forward(A: Tensor, b: Tensor) -> tuple[Tensor, ...]:
-        return on_arrays(exact.inscribed_ball, A, b)
+        return on_items(exact.inscribed_ball, A, b)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
@@ -260,7 +260,8 @@ class _InscribedBall(torch.autograd.Function):
         """The rows (a, |a|), the points where the ball touches them, a mask of real rows, and their indices."""
         real, rows = rows < A.shape[-2], rows.clamp(max=A.shape[-2] - 1)
         N, index = _taken(A, rows)
-        N = torch.where(real.unsqueeze(-1), N, torch.as_tensor(simplex_around(A.shape[-1])[:, :-1], device=A.device))
+        sides = torch.from_numpy(simplex_around(A.shape[-1])[:, :-1]).to(A.device, non_blocking=True)
+        N = torch.where(real.unsqueeze(-1), N, sides)
         norms = lengths(N).unsqueeze(-1)
         touching = _finite(centre).unsqueeze(-2) + _finite(radius)[..., None, None] * N / norms
         return torch.cat([N, norms], dim=-1), touching, real, rows, index
@@ -269,7 +270,7 @@ class _InscribedBall(torch.autograd.Function):
     def backward(ctx: Any, grad_centre: Tensor, grad_radius: Tensor, *_: Tensor) -> tuple[Tensor, Tensor]:
         A, centre, radius, rows = ctx.saved_tensors
         if _first_derivatives_suffice():
-            grad_A, grad_b = on_arrays(exact.inscribed_ball_vjp, A, centre, radius, rows, grad_centre, grad_radius)
+            grad_A, grad_b = on_items(exact.inscribed_ball_vjp, A, centre, radius, rows, grad_centre, grad_radius)
             return grad_A, grad_b
         M, touching, real, rows, index = _InscribedBall._system(A, centre, radius, rows)
         given = torch.cat([grad_centre, grad_radius.unsqueeze(-1)], dim=-1)
@@ -327,17 +328,6 @@ def _definite(metric: Tensor | None, ok: Tensor) -> Tensor | None:
 
 def times(M: Tensor, v: Tensor) -> Tensor:
     return (M @ v.unsqueeze(-1)).squeeze(-1)
-
-
-def on_arrays(of: Callable[..., tuple], A: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
-    """Apply a function of numpy arrays with one batch dimension to tensors with any number. A is (*batch, m, p)."""
-    batch, device = A.shape[:-2], A.device
-    arrays = (
-        t.detach().cpu().contiguous().numpy().reshape((batch.numel(), *t.shape[len(batch) :])) for t in (A, *others)
-    )
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        found = of(*arrays)
-    return tuple(torch.from_numpy(array.reshape((*batch, *array.shape[1:]))).to(device) for array in found)
 
 
 def in_front(size: int, dims: tuple, inputs: tuple) -> list[Tensor | float | None]:

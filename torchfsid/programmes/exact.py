@@ -6,7 +6,6 @@ solved again in rational arithmetic (`rational`).
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from torchfsid.kernels import implicit
 from torchfsid.kernels import programmes as kernel
+from torchfsid.kernels.active_rows import simplex_around
 from torchfsid.kernels.threads import over_items
 from torchfsid.programmes import rational
 
@@ -94,13 +94,6 @@ def inscribed_ball_vjp(
         A, centre, radius, rows, grad_centre, grad_radius, grad_A, grad_b,
     )  # fmt: skip
     return grad_A, grad_b
-
-
-@cache
-def simplex_around(p: int) -> Reals:
-    """Rows (a, 1) with the unit outward normals a of the p + 1 sides of a simplex."""
-    normals = np.concatenate([-np.eye(p), np.full((1, p), p**-0.5)])
-    return np.column_stack([normals, np.ones(p + 1)])
 
 
 def _or_identity(metric: Reals | None, p: int) -> Reals:

@@ -137,7 +137,7 @@ def solution(
         c, d = residual.unbind(-1)
         step = torch.stack([c * s - d * q, p * d - r * c], dim=-1) / (p * s - q * r).unsqueeze(-1)
     else:
-        step = torch.linalg.solve(M, residual)
+        step = torch.linalg.solve_ex(M, residual).result  # `solve` would wait for a device, to raise
     return number + (step - step.detach())
 
 

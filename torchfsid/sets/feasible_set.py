@@ -26,10 +26,9 @@ from torch import Tensor
 
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, array, as_halfspaces, finite
-from torchfsid.kernels import extent
 from torchfsid.outcome import Status
 from torchfsid.programmes.differentiable import inscribed_ball, symmetric
-from torchfsid.sets import given, sampling, saved
+from torchfsid.sets import given, sampling, saved, searches
 from torchfsid.sets.facets import Emptiness, Facets
 
 MAX_FACETS = 32
@@ -266,8 +265,8 @@ class FeasibleSet:
         points = points.expand(torch.broadcast_shapes(points.shape, (*batch, p)))
         shape = points.shape[: points.ndim - 1 - len(batch)].numel(), batch.numel(), p
         sets = self.body.corners, self.body.A, self.body.b, self.body.reach
-        inside = torch.from_numpy(extent.contains(*map(array, sets), array(points.reshape(shape)), tolerance))
-        return inside.to(self.outcome.device).reshape(points.shape[:-1]) & ~self.is_empty
+        inside = searches.contains(*sets, points.reshape(shape).transpose(0, 1), tolerance)
+        return inside.transpose(0, 1).reshape(points.shape[:-1]) & ~self.is_empty
 
     def volume(self) -> Float[Tensor, "*batch"]:
         """The length for p = 1, the area in the plane, the volume for p >= 3. 0 for an EMPTY item."""

@@ -22,11 +22,10 @@ from torch import Tensor
 
 from torchfsid import device
 from torchfsid.halfspaces import Halfspaces, array
-from torchfsid.kernels import disc, extent, foot
 from torchfsid.kernels import polygon as kernel
 from torchfsid.outcome import Status
 from torchfsid.programmes.differentiable import inscribed_ball
-from torchfsid.sets import derivatives
+from torchfsid.sets import derivatives, searches
 from torchfsid.sets.body import PRIOR, Clipped, Contradiction
 from torchfsid.sets.derivatives import Skeleton, at
 from torchfsid.sets.provenance import Sheets
@@ -204,7 +203,7 @@ class Polygon:
 
     def diameter(self) -> Float[Tensor, "B"]:
         """The largest distance between two points of the set."""
-        ends, distance = (torch.from_numpy(part).to(self.b.device) for part in extent.farthest(array(self.corners)))
+        ends, distance = searches.farthest(self.corners)
         return derivatives.distance(distance, at(self.vertices, ends)) if self._differentiable() else distance
 
     def support(self, direction: Float[Tensor, "B D 2"]) -> Float[Tensor, "B D"]:
@@ -219,14 +218,12 @@ class Polygon:
         returned. Its gradient is that of the three rows that decide this choice. The radius and its gradient are right
         in any case. Where no disc could be verified as a largest one, it is the largest about a point of the set.
         """
-        numbers = disc.inscribed(*map(array, (self.corners, self.A, self.b, self.count)))
-        centre, radius = (torch.from_numpy(part).to(self.b.device) for part in numbers[:2])
-        if not numbers[3].all():
-            lost = torch.from_numpy((~numbers[3]).nonzero()[0]).to(self.b.device)
+        centre, radius, rows, found = searches.inscribed(self.corners, self.A, self.b, self.count)
+        if not bool(found.all()):
+            lost = (~found).nonzero().squeeze(-1)
             centre[lost], radius[lost] = self.select(lost)._disc_by_programme()
         if not self._differentiable():
             return centre, radius
-        rows, found = (torch.from_numpy(part).to(self.b.device) for part in numbers[2:])
         centre, radius = derivatives.inscribed_ball(*self.rows(), centre, radius, rows, found)
         return centre, torch.where(radius > 0, radius, 0.0)
 
@@ -235,8 +232,7 @@ class Polygon:
     ) -> Float[Tensor, "B 2"]:
         """The point of the set nearest to `point` in the norm sqrt(z' metric z) (default: Euclidean)."""
         H = torch.eye(2, dtype=point.dtype, device=point.device).expand(len(point), 2, 2) if metric is None else metric
-        numbers = foot.feet(*map(array, (self.corners, self.A, self.b, self.count, point, H)))
-        found, active = (torch.from_numpy(part).to(point.device) for part in numbers)
+        found, active = searches.feet(self.corners, self.A, self.b, self.count, point, H)
         if not self._differentiable(point, H):
             return found
         # Two equations M z = right. At a vertex they are the active rows. On an edge t, the second one is

@@ -21,9 +21,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchfsid.halfspaces import Halfspaces, array
-from torchfsid.kernels import extent, solid
 from torchfsid.kernels import polyhedron as kernel
-from torchfsid.sets import derivatives, recentred
+from torchfsid.kernels import solid
+from torchfsid.sets import derivatives, recentred, searches
 from torchfsid.sets.body import PRIOR, Clipped, Contradiction
 from torchfsid.sets.derivatives import Skeleton, at
 from torchfsid.sets.provenance import Sheets
@@ -188,7 +188,7 @@ class Polyhedron:
 
     def diameter(self) -> Float[Tensor, "B"]:
         """The largest distance between two points of the set."""
-        ends, distance = (torch.from_numpy(part).to(self.A.device) for part in extent.farthest(array(self.corners)))
+        ends, distance = searches.farthest(self.corners)
         if not self._differentiable:
             return distance
         first, last = at(self.corners, ends).unbind(1)

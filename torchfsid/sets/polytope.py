@@ -21,9 +21,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchfsid.halfspaces import array
-from torchfsid.kernels import extent
 from torchfsid.outcome import Status
-from torchfsid.sets import derivatives, recentred, sensitivity
+from torchfsid.sets import derivatives, recentred, searches, sensitivity
 from torchfsid.sets.body import PRIOR, Clipped, Contradiction
 from torchfsid.sets.cell import Cell, intersect, merged
 from torchfsid.sets.derivatives import at
@@ -167,7 +166,7 @@ class Polytope:
 
     def diameter(self) -> Float[Tensor, "B"]:
         """The largest distance between two points of the set."""
-        ends, distance = (torch.from_numpy(part).to(self.A.device) for part in extent.farthest(array(self.corners)))
+        ends, distance = searches.farthest(self.corners)
         if not self._differentiable:
             return distance
         first, last = at(self.corners, ends).unbind(1)
