@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from jaxtyping import Float
 from torch import Tensor
@@ -40,32 +41,25 @@ class Recording:
     samples: int
 
 
-@dataclass(frozen=True)
-class SimulatedScene:
-    """A scene that was run: its true trajectory, and the one measured with errors."""
+class SimulatedScene(NamedTuple):
+    """A scene that was run: its true trajectory, the one measured with errors, and the recording of its robots."""
 
-    config: SceneConfig
-    task: Task
-    barriers: list[Barrier]
-    goals: Float[Tensor, "robots n"]
     true: Trajectory
     measured: Trajectory
-
-    def recording(self) -> Recording:
-        """The recording of the scene's robots."""
-        return Recording(
-            robots=[robot.name for robot in self.config.robots],
-            goals=self.goals,
-            task=self.task,
-            barriers=self.barriers,
-            labels=[label for barrier in self.barriers for label in barrier.labels(self.config.bodies)],
-            measurements=self.measured.measurements(),
-            samples=len(self.measured.t),
-        )
+    recording: Recording
 
 
 def simulate_scene(config: SceneConfig) -> SimulatedScene:
     """Run the scene's robots from rest in closed loop, and measure them with the configured errors."""
     batch = Batch([config])
-    model = batch.model(batch.team)
-    return SimulatedScene(config, model.task, model.barriers, batch.goals, batch.true.team(0), measure(batch).team(0))
+    model, measured = batch.model(batch.team), measure(batch).team(0)
+    recording = Recording(
+        robots=[robot.name for robot in config.robots],
+        goals=batch.goals,
+        task=model.task,
+        barriers=model.barriers,
+        labels=[label for barrier in model.barriers for label in barrier.labels(config.bodies)],
+        measurements=measured.measurements(),
+        samples=len(measured.t),
+    )
+    return SimulatedScene(batch.true.team(0), measured, recording)

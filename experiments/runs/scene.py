@@ -21,7 +21,7 @@ def run_scene(config: SceneConfig, out: Path, track: Track) -> dict[str, Any]:
     """Simulate, observe, and return the summary."""
     scene = simulate_scene(config)
     write_trajectory(out / "trajectory.csv", config.bodies, scene.measured)
-    observers, tally = observe(config, scene.recording(), out, track)
+    observers, tally = observe(config, scene.recording, out, track)
     return summarise_scene(config, Results(out, config), observers, tally, scene.true)
 
 
