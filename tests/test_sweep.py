@@ -129,6 +129,25 @@ def test_killed_twice_and_resumed_is_the_uninterrupted_sweep(config: Path, unint
     assert_same_tables(tmp_path, uninterrupted)
 
 
+def test_a_part_that_was_interrupted_is_run_again_and_keeps_its_records(
+    config: Path, uninterrupted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("experiments.sweeps.sweep.PARTS", 2)
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    for out in (whole, broken):
+        out.mkdir()
+    run_sweep(load_sweep(config), whole, untracked)
+    lines = (whole / "records.jsonl").read_bytes().splitlines(keepends=True)
+    (broken / "records.jsonl").write_bytes(b"".join(lines[:2]))
+    run_sweep(load_sweep(config), broken, untracked)
+    resumed = (broken / "records.jsonl").read_bytes().splitlines(keepends=True)
+    assert resumed[:2] == lines[:2]
+    assert sorted(json.loads(line)["run"] for line in resumed) == list(range(RUNS))
+    assert_same_tables(whole, broken)
+    alone, together = (read_table(out / "runs.parquet") for out in (uninterrupted, whole))
+    assert list(alone) == list(together)
+
+
 def test_a_dask_cluster_gives_the_same(config: Path, uninterrupted: Path, tmp_path: Path):
     # Workers in threads, reached over TCP: starting processes would take longer than the sweep.
     local = {"processes": False, "protocol": "tcp://", "dashboard_address": None}
