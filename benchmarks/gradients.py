@@ -126,7 +126,7 @@ def probe(repeats: int) -> list[dict[str, Any]]:
     config = load(Path("configs/probe_placement.yaml"), [], "design")
     probing, found = Probing.of(config), []
     goals = probing.draw_goals(config.goals.train, 1)
-    drawn = Search.of(probing, goals, 3, np.random.SeedSequence(0)).near_path(256)
+    drawn = Search.of(probing, config.search, goals, 3, np.random.SeedSequence(0)).near_path(256)
     with torch.no_grad():
         left = probing.left(drawn, goals)
         drawn = drawn[left.sound.all(-1) & (left.area < probing.prior_area / 2).any(-1)]

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from torchfsid import device
+from torchfsid.kernels.cuda import launch
 
 
 def test_on_the_simulator() -> None:
@@ -21,6 +22,17 @@ def test_on_the_simulator() -> None:
     environment = {**os.environ, "NUMBA_ENABLE_CUDASIM": "1"}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=Path(__file__).parent.parent)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_a_name_that_numpy_has_dropped_is_lent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """numba-cuda finds `row_stack` while it is imported, and numpy is as it was after that."""
+    found: list[bool] = []
+    monkeypatch.delattr(np, "row_stack", raising=False)
+    monkeypatch.setattr(launch.importlib.util, "find_spec", lambda name: name)
+    monkeypatch.setattr(launch.importlib, "import_module", lambda name: found.append("row_stack" in vars(np)))
+    launch.probe()
+    assert found == [True]
+    assert "row_stack" not in vars(np)
 
 
 @pytest.fixture

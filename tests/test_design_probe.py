@@ -16,7 +16,6 @@ from experiments.__main__ import main
 from experiments.design.config import ProbePlacementConfig
 from experiments.design.placement import place
 from experiments.design.probe import Objective, Probing, along, expectation
-from experiments.design.runs import follow
 from experiments.kinds import load as load_config
 from experiments.results import read_columns
 from experiments.studies.switches import across, summarise_switches
@@ -169,11 +168,11 @@ def test_compiled_runs_are_the_closed_loop(avoidance: str, placements: Tensor | 
     probing = Probing.of(load(avoidance))
     goals = probing.draw_goals(8, seed=5)
     runs, samples = probing.run(placements, goals), list(probing.loop(placements, goals))
-    x, u, bodies = (torch.stack([getattr(s.measurement, name) for s in samples]) for name in ("x", "u", "bodies"))
+    x, u, bodies = (torch.stack([getattr(s.measurement, name) for s in samples], 1) for name in ("x", "u", "bodies"))
     torch.testing.assert_close(runs.x, x, rtol=0, atol=1e-12)
     torch.testing.assert_close(runs.u, u, rtol=0, atol=1e-12)
     assert torch.equal(runs.bodies, bodies)
-    active, feasible = (torch.stack([getattr(s.control, name) for s in samples]) for name in ("active", "feasible"))
+    active, feasible = (torch.stack([getattr(s.control, name) for s in samples], 1) for name in ("active", "feasible"))
     assert torch.equal(runs.feasible, feasible)
     ours = torch.zeros_like(active, dtype=torch.long).scatter_add(-1, runs.rows, runs.filled.long())
     assert torch.equal(ours.bool(), active)
@@ -186,15 +185,13 @@ def test_gradients_of_runs_are_those_of_the_closed_loop(avoidance: str):
     probing = Probing.of(load(avoidance))
     goals, rng = probing.draw_goals(8, seed=5), np.random.default_rng(0)
     placements = PATHS.clone().requires_grad_()
-    T, B = probing.config.steps, len(PATHS) * len(goals)
-    weights, used = torch.from_numpy(rng.normal(size=(2, T, B, 2))), torch.from_numpy(rng.uniform(size=(T, B)) < 0.2)
+    T, B = probing.steps, len(PATHS) * len(goals)
+    weights, used = torch.from_numpy(rng.normal(size=(2, B, T, 2))), torch.from_numpy(rng.uniform(size=(B, T)) < 0.2)
     weights = weights * used.unsqueeze(-1)
-    probe = probing.path(placements, T).repeat_interleave(len(goals), dim=1)
-    runs = probing.run(placements, goals)
-    found = follow(probing.controller, goals.repeat(len(PATHS), 1), runs, probe, used, probing.config.dt)
+    found = probing.run(placements, goals).along(probing.path(placements, T))
     (ours,) = torch.autograd.grad((torch.stack(found) * weights).sum(), placements)
     samples = [sample.measurement for sample in probing.loop(placements, goals)]
-    by_steps = torch.stack([torch.stack([getattr(s, name) for s in samples]) for name in ("x", "u")])
+    by_steps = torch.stack([torch.stack([getattr(s, name) for s in samples], 1) for name in ("x", "u")])
     (theirs,) = torch.autograd.grad((by_steps * weights).sum(), placements)
     torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
     assert (theirs[:2].flatten(1).norm(dim=-1) > 0.1).all()

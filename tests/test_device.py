@@ -106,3 +106,16 @@ def test_layers_run_where_their_rows_are() -> None:
         (centre.sum() + radius.sum() + near.sum() + weighted.sum()).backward()
     assert A.grad is not None
     assert bool(A.grad.isfinite().all())
+
+
+def test_constants_outlive_no_transform() -> None:
+    """The limits of a speed box are kept, but not those that were made within a transform."""
+    box, x = SpeedBox((1.25, 1.5)), torch.zeros(2, dtype=torch.float64)
+
+    def largest(x: Tensor) -> Tensor:
+        rows = box(fsid.Measurement(t=0.0, x=x, u=None, bodies=x.new_zeros(0, 2), present=x.new_zeros(0).bool()))
+        return (rows.A @ x - rows.b).sum()
+
+    torch.func.grad(largest)(x)
+    assert float(largest(x)) == -5.5
+    assert torch.equal(torch.func.grad(largest)(x), torch.zeros_like(x))

@@ -18,8 +18,9 @@ from torch.autograd import gradcheck, gradgradcheck
 from tests.problems import CASES, batch, paper_case, random_scene
 from tests.reference_clip import Rings
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.identification.critical_region import critical_region
+from torchfsid.identification.critical_region import critical_region, region_of
 from torchfsid.identification.inverse_optimal import inverse_optimal_set
+from torchfsid.identification.kkt import solve_unit
 from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.measurement import Measurement
@@ -218,6 +219,26 @@ def test_critical_region(case: str):
     )
     assert gradcheck(region_rows, inputs)
     assert gradgradcheck(region_rows, inputs)
+
+
+def test_compiled_critical_regions_are_those_of_torch():
+    """Of 300 random scenes and all cases in one batch: rows, names, derivatives."""
+    rng = np.random.default_rng(8)
+    scenes = [random_scene(rng, int(rng.integers(1, 9))) for _ in range(300)]
+    safe, active, _, C, d = batch([*scenes, *(paper_case(case, rng) for case in CASES)])
+    leaves = [part.requires_grad_() for part in (safe.A, safe.b, C, d)]
+    rows, found = Halfspaces(*leaves[:2]), []
+    unit = rows.normalised()
+    reference = region_of(unit, solve_unit(unit, active, C, d), C, d)
+    is_row = (reference.A != 0).any(-1)
+    weights = torch.from_numpy(rng.normal(size=(2, *reference.b.shape)))
+    for region in (critical_region(rows, active, C, d), reference):
+        value = (weights[0] * region.A.sum(-1) + weights[1] * region.b)[is_row].sum()
+        found.append([region.A, region.b, *torch.autograd.grad(value, leaves)])
+        assert region.source is not None
+        found[-1].append(region.source[is_row])
+    for ours, theirs in zip(*found, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
 
 
 def test_critical_region_at_orthogonal_equal_rows():

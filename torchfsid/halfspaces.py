@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchfsid.device import all_seen
 from torchfsid.errors import InputError
 from torchfsid.tolerances import ROUND_OFF
 
@@ -97,7 +98,7 @@ class Halfspaces:
 
     def where(self, keep: Bool[Tensor, "*batch m"]) -> Halfspaces:
         """Keep the rows marked by `keep`. The others become padding 0.z <= 1."""
-        if bool(keep.all()):
+        if all_seen(keep):
             return self
         return Halfspaces(torch.where(keep.unsqueeze(-1), self.A, 0.0), torch.where(keep, self.b, 1.0), self.source)
 

@@ -78,7 +78,7 @@ class _Corridor:
         started = time.perf_counter()
         # Every method has the same random numbers: the same starts, the same random places.
         seed = np.random.SeedSequence(self._searching.entropy, spawn_key=(*self._searching.spawn_key, K))
-        search = Search.of(self.probing, self.train, K, seed)
+        search = Search.of(self.probing, self.config.search, self.train, K, seed)
         found = METHODS[method](search)
         chosen = choose(search, found, self.validation)
         seconds = time.perf_counter() - started

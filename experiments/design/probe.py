@@ -34,27 +34,38 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from experiments.design.config import BoxConfig, ProbePlacementConfig
-from experiments.design.runs import Runs, follow, run
+from experiments.design.runs import Runs, run
 from torchfsid.halfspaces import Halfspaces
-from torchfsid.identification.evidence import ObservationModel, evidence
+from torchfsid.identification.critical_region import critical_region
+from torchfsid.identification.evidence import ObservationModel, SetKind, evidence
+from torchfsid.identification.inverse_optimal import inverse_optimal_set
+from torchfsid.robots.avoidance import CollisionAvoidance
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.simulation import Sample, closed_loop
 from torchfsid.robots.tasks import GoalTask
 from torchfsid.sets.feasible_set import FeasibleSet
+from torchfsid.sets.provenance import carried
+from torchfsid.tolerances import ACTIVE_TOLERANCE
+
+if TYPE_CHECKING:
+    from experiments.design.config import ProbePlacementConfig
 
 Objective = Literal["area", "log_area"]
 
 TOUCHING = 1e-9
 """Round-off allowed in the distance between probe and robot, and of a goal from its set [m]."""
+
+Box = Float[Tensor, "2 2"]
+"""Lower and upper corner of a rectangle [m]."""
 
 
 class Left(NamedTuple):
@@ -73,47 +84,84 @@ class Left(NamedTuple):
 class Probing:
     """A robot in a corridor, the prior of its goal, and the room for a probe.
 
+    Its methods compute where the placements and goals are that they are given.
+
     Attributes:
-        config: the configuration.
+        task: the robot's task.
+        avoidance: its barrier by a safety distance, which ignores neighbours' velocities.
         obstacles: obstacles of the corridor [m].
         start: start of the robot [m].
+        prior: Theta_0 [m].
+        room: the room for way-points [m].
+        dt: sampling time [s].
+        steps: number of samples of a run.
+        kind: the set that the observer uses.
+        noise: its bounds, see `ObservationModel`.
+        active_tolerance: see `ObservationModel`.
     """
 
-    config: ProbePlacementConfig
+    task: GoalTask
+    avoidance: CollisionAvoidance
     obstacles: Float[Tensor, "m 2"]
     start: Float[Tensor, "2"]
+    prior: Box
+    room: Box
+    dt: float
+    steps: int
+    kind: SetKind = "critical_region"
+    noise: NoiseBound | None = None
+    active_tolerance: float = ACTIVE_TOLERANCE
 
     @classmethod
     def of(cls, config: ProbePlacementConfig, shift: Float[Tensor, "m 2"] | float = 0.0) -> Probing:
         """The scene of the configuration, with its obstacles moved by `shift` [m]."""
-        obstacles = torch.tensor(config.obstacles, dtype=torch.float64) + shift
-        return cls(config, obstacles, torch.tensor(config.start, dtype=torch.float64))
+        prior, room = (torch.tensor([box.lower, box.upper], dtype=torch.float64) for box in (config.prior, config.room))
+        return cls(
+            GoalTask(config.gain),
+            config.avoidance.build([]),  # type: ignore[arg-type]
+            torch.tensor(config.obstacles, dtype=torch.float64) + shift,
+            torch.tensor(config.start, dtype=torch.float64),
+            prior,
+            room,
+            config.dt,
+            config.steps,
+            config.set,
+            NoiseBound(config.velocity_noise) if config.set == "inverse_optimal" else None,
+            config.active_tolerance,
+        )
+
+    @cached_property
+    def model(self) -> ObservationModel:
+        """The model of the robot that the observer assumes, which is that of the robot itself."""
+        return ObservationModel(self.task, [self.avoidance], self.kind, self.noise, self.active_tolerance)
+
+    def to(self, device: torch.device | str) -> Probing:
+        """The scene on another device."""
+        tensors: dict[str, Any] = {name: part for name, part in vars(self).items() if isinstance(part, Tensor)}
+        if all(part.device == torch.device(device) for part in tensors.values()):
+            return self
+        return replace(self, **{name: part.to(device) for name, part in tensors.items()})
 
     @property
-    def prior(self) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
-        """Lower and upper corner of Theta_0 [m]."""
-        return _corners(self.config.prior)
-
-    @property
-    def room(self) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
-        """Lower and upper corner of the room for way-points [m]."""
-        return _corners(self.config.room)
+    def safety_distance(self) -> float:
+        """The safety distance of the robot's barrier [m]."""
+        return float(self.avoidance.safety_distance)  # type: ignore[arg-type]
 
     @property
     def prior_area(self) -> float:
         """The area A_0 of Theta_0 [m^2]."""
-        lower, upper = self.prior
-        return float((upper - lower).prod())
+        return float((self.prior[1] - self.prior[0]).prod())
 
     def draw_goals(self, count: int, seed: int) -> Float[Tensor, "count 2"]:
         """Goals evenly spread over Theta_0 (scrambled Sobol points) [m]."""
         lower, upper = self.prior
-        return lower + (upper - lower) * torch.quasirandom.SobolEngine(2, True, seed).draw(count, dtype=torch.float64)
+        even = torch.quasirandom.SobolEngine(2, True, seed).draw(count, dtype=torch.float64)
+        return lower + (upper - lower) * even.to(lower)
 
     def grid(self, columns: int, rows: int) -> Float[Tensor, "places 2"]:
         """Centres of the cells of a grid over the room, row by row [m]."""
         lower, upper = self.room
-        x, y = ((torch.arange(count, dtype=torch.float64) + 0.5) / count for count in (columns, rows))
+        x, y = ((torch.arange(count).to(lower) + 0.5) / count for count in (columns, rows))
         return lower + (upper - lower) * torch.cartesian_prod(y, x).flip(-1)
 
     def allowed(self, placements: Float[Tensor, "P K 2"]) -> Float[Tensor, "P K 2"]:
@@ -121,59 +169,51 @@ class Probing:
 
         All way-points are in the room, and the first keeps the safety distance from the robot's start.
         """
-        lower, upper = self.room
-        placements = placements.clamp(lower, upper)
-        away = placements[:, 0] - self.start
+        scene, Ds = self.to(placements.device), self.safety_distance
+        placements = placements.clamp(*scene.room)
+        away = placements[:, 0] - scene.start
         distance = away.norm(dim=-1, keepdim=True)
         outward = torch.where(distance > 0, away / distance, away.new_tensor([1.0, 0.0]))
-        Ds = self.config.safety_distance
-        first = torch.where(distance < Ds, self.start + Ds * (1 + TOUCHING) * outward, placements[:, 0])
+        first = torch.where(distance < Ds, scene.start + Ds * (1 + TOUCHING) * outward, placements[:, 0])
         return torch.cat([first.unsqueeze(1), placements[:, 1:]], dim=1)
-
-    @property
-    def controller(self) -> CbfQpController:
-        """The robot's controller."""
-        return CbfQpController(GoalTask(self.config.gain), [self.config.avoidance.build([])])
-
-    @property
-    def model(self) -> ObservationModel:
-        """The model of the robot that the observer assumes."""
-        config, controller = self.config, self.controller
-        noise = NoiseBound(config.velocity_noise) if config.set == "inverse_optimal" else None
-        return ObservationModel(controller.task, controller.barriers, config.set, noise, config.active_tolerance)
 
     def loop(self, placements: Float[Tensor, "P K 2"] | None, goals: Float[Tensor, "S 2"]) -> Iterator[Sample]:
         """The robot in closed loop, with every placement [m] (None: no probe) and every goal [m]: P x S items."""
-        bodies = self._bodies(placements, self.config.steps).repeat_interleave(len(goals), dim=1)
-        (T, B), dt, present = bodies.shape[:2], self.config.dt, torch.ones(bodies.shape[1:3], dtype=torch.bool)
+        scene, dt = self.to(goals.device), self.dt
+        bodies = scene._bodies(placements, self.steps).repeat_interleave(len(goals), dim=0)
+        B, present = len(bodies), torch.ones_like(bodies[:, 0, :, 0], dtype=torch.bool)
 
         def around(t: float, x: Tensor, _: Tensor) -> Measurement:
-            return Measurement(t=t, x=x, u=None, bodies=bodies[round(t / dt)], present=present)
+            return Measurement(t=t, x=x, u=None, bodies=bodies[:, round(t / dt)], present=present)
 
-        theta, start = goals.repeat(B // len(goals), 1), self.start.expand(B, 2)
-        return closed_loop(self.controller, theta, start, around, dt=dt, samples=T)
+        theta, controller = goals.repeat(B // len(goals), 1), CbfQpController(self.task, [self.avoidance])
+        return closed_loop(controller, theta, scene.start.expand(B, 2), around, dt=dt, samples=self.steps)
 
+    @torch.no_grad()
     def run(
         self, placements: Float[Tensor, "P K 2"] | None, goals: Float[Tensor, "S 2"], steps: int | None = None
     ) -> Runs:
         """The same closed loop in compiled code, all samples at once, without gradients."""
-        with torch.no_grad():
-            return run(self.config, self.start, goals, self._bodies(placements, steps or self.config.steps))
+        scene = self.to(goals.device)
+        return run(
+            self.task, self.avoidance, scene.start, goals, scene._bodies(placements, steps or self.steps), self.dt
+        )
 
-    def _bodies(self, placements: Float[Tensor, "P K 2"] | None, samples: int) -> Float[Tensor, "T P M 2"]:
+    def _bodies(self, placements: Float[Tensor, "P K 2"] | None, samples: int) -> Float[Tensor, "P T M 2"]:
         """The obstacles and the probe at each sample [m]."""
         if placements is None:
-            return self.obstacles.expand(samples, 1, -1, -1)
+            return self.obstacles.expand(1, samples, -1, -1)
         path = self.path(placements, samples)
         return torch.cat([self.obstacles.expand(*path.shape[:2], -1, -1), path.unsqueeze(2)], dim=2)
 
-    def path(self, placements: Float[Tensor, "P K 2"], samples: int) -> Float[Tensor, "T P 2"]:
+    def path(self, placements: Float[Tensor, "P K 2"], samples: int) -> Float[Tensor, "P T 2"]:
         """The positions of the probe at the first samples [m]."""
-        return along(placements, torch.arange(samples, dtype=torch.float64) / max(self.config.steps - 1, 1))
+        return along(placements, torch.arange(samples).to(placements) / max(self.steps - 1, 1))
 
     def prior_of(self, items: int) -> FeasibleSet:
         """Theta_0, once for each item."""
-        return self.config.prior.build(items)
+        lower, upper = self.prior.unsqueeze(1).expand(2, items, 2)
+        return FeasibleSet.from_box(lower, upper)
 
     def left(
         self, placements: Float[Tensor, "P K 2"] | None, goals: Float[Tensor, "S 2"], steps: int | None = None
@@ -181,45 +221,55 @@ class Probing:
         """What is left of Theta with every placement and every goal.
 
         The evidence of a sample does not depend on Theta, so all samples are read at once. Samples with a facet in
-        Theta(T) are read once more with gradients. The others do not change it.
+        Theta(T) become half-spaces once more, with gradients, which these facets then carry. The others do not change
+        Theta(T).
 
         Args:
             placements: way-points [m], or None for no probe.
             goals: goals [m].
             steps: number of samples. Default: the whole run.
         """
-        runs, model, dt = self.run(placements, goals, steps), self.model, self.config.dt
-        T, B = runs.feasible.shape
-        seen, prior, theta = runs.measurement(dt), self.prior_of(B), goals.repeat(B // len(goals), 1)
+        scene, runs = self.to(goals.device), self.run(placements, goals, steps)
+        (B, T), seen, prior = runs.feasible.shape, runs.measurement(), scene.prior_of(1)
         with torch.no_grad():
-            found = evidence(model, prior, seen)
-            A, b = (rows.unflatten(0, (T, B)).transpose(0, 1).flatten(1, 2) for rows in (found.omega.A, found.omega.b))
-            theta_set = prior.intersect(Halfspaces(A, b))
-        sound = runs.feasible.all(0) & ~theta_set.is_empty & ~found.alarmed.reshape(T, B).any(0)
-        if placements is not None:
-            apart = (runs.x - runs.bodies[:, :, -1]).norm(dim=-1)
-            sound = sound & (apart >= self.config.safety_distance - TOUCHING).all(0)
-        sound = sound & theta_set.contains(theta, TOUCHING)
+            found = evidence(self.model, prior, seen)
+            omega, R = found.omega, found.omega.rows
+            parts = (part.unflatten(0, (B, T)).flatten(1, 2) for part in (omega.A, omega.b))
+            theta = scene.prior_of(B).intersect(Halfspaces(*parts))
+            sound = runs.feasible.all(1) & ~theta.is_empty & ~found.alarmed.view(B, T).any(1)
+            if placements is not None:
+                apart = (runs.x - seen.bodies[:, -1].view_as(runs.x)).norm(dim=-1)
+                sound = sound & (apart >= self.safety_distance - TOUCHING).all(1)
+            sound = sound & theta.contains(goals.repeat(B // len(goals), 1), TOUCHING)
         if torch.is_grad_enabled() and placements is not None and placements.requires_grad:
-            sample = theta_set.facets().source // found.omega.rows  # negative: a facet of the prior
-            needed = torch.zeros(T + 1, B, dtype=torch.bool).scatter(0, sample.T % (T + 1), True)[:T] & sound
-            probe = self.path(placements, T).repeat_interleave(len(goals), dim=1)
-            x, u = follow(self.controller, theta, runs, probe, needed, dt)
-            again = seen.select(needed.flatten())
-            bodies = torch.cat([again.bodies[:, :-1], probe[needed].unsqueeze(1)], dim=1)
-            again = replace(again, x=x[needed], u=u[needed], bodies=bodies)
-            told = evidence(model, self.prior_of(len(again.x)), again).omega
-            theta_set = prior.intersect(_by_item(told, needed))
-        area = torch.where(sound, theta_set.volume(), self.prior_area)
+            facets = theta.facets()
+            here = (facets.source >= 0) & sound.unsqueeze(1)  # it is negative for facets of the prior
+            item, slot = here.nonzero(as_tuple=True)
+            sample, of_facet = (item * T + facets.source[item, slot] // R).unique(return_inverse=True)
+            again, path = seen.select(sample), self.path(placements, T)
+            x, u = (part.flatten(0, 1).index_select(0, sample) for part in runs.along(path))
+            probe = path.flatten(0, 1).index_select(0, sample // (T * len(goals)) * T + sample % T)
+            bodies = torch.cat([again.bodies[:, :-1], probe.unsqueeze(1)], dim=1)
+            told = self._omega(replace(again, x=x, u=u, bodies=bodies), found.kkt.active[sample])
+            theta = carried(theta, (item, slot), told.select(of_facet))
+        area = torch.where(sound, theta.volume(), self.prior_area)
         return Left(area.reshape(-1, len(goals)), sound.reshape(-1, len(goals)))
 
+    def _omega(self, informative: Measurement, active: Bool[Tensor, "B m"]) -> Halfspaces:
+        """The half-spaces of `evidence`, given the rows that were found to be active."""
+        rows, (C, d), u = self.avoidance(informative), self.task(informative), informative.u
+        if self.kind == "critical_region":
+            return critical_region(rows, active, C, d)
+        assert u is not None
+        assert self.noise is not None
+        return inverse_optimal_set(rows, u, C, d, self.noise)
 
-def along(placements: Float[Tensor, "P K 2"], fraction: float | Float[Tensor, "T"]) -> Float[Tensor, "*T P 2"]:
+
+def along(placements: Float[Tensor, "P K 2"], fraction: float | Float[Tensor, "T"]) -> Float[Tensor, "P *T 2"]:
     """The position of the probe after this fraction of the run [m]."""
     K = placements.shape[1]
-    way = (K - 1) * torch.as_tensor(fraction, dtype=torch.float64).unsqueeze(-1)
-    weights = (1 - (way - torch.arange(K)).abs()).clamp(min=0)  # of the two way-points before and after it
-    return (weights[..., None, :, None] * placements).sum(-2)
+    way = (K - 1) * torch.as_tensor(fraction, dtype=torch.float64, device=placements.device).unsqueeze(-1)
+    return (1 - (way - torch.arange(K, device=way.device)).abs()).clamp(min=0) @ placements
 
 
 def expectation(area: Float[Tensor, "P S"], objective: Objective) -> Float[Tensor, "P"]:
@@ -236,20 +286,3 @@ def expectation(area: Float[Tensor, "P S"], objective: Objective) -> Float[Tenso
 def slope(value: Float[Tensor, ""], placements: Float[Tensor, "P K 2"]) -> Float[Tensor, "P K 2"]:
     """The gradient of a sum over placements. It is zero if no placement changes anything."""
     return torch.autograd.grad(value, placements)[0] if value.requires_grad else torch.zeros_like(placements)
-
-
-def _by_item(rows: Halfspaces, used: Bool[Tensor, "T B"]) -> Halfspaces:
-    """The rows of the `used` samples, stacked for each item.
-
-    `rows` has these samples only, in the order of time.
-    """
-    B, item, slot = used.shape[1], used.nonzero()[:, 1], (used.long().cumsum(0) - 1)[used]
-    most = int(used.sum(0).max())
-    A, b = rows.A.new_zeros(B, most, *rows.A.shape[1:]), rows.b.new_ones(B, most, rows.rows)
-    A, b = A.index_put((item, slot), rows.A), b.index_put((item, slot), rows.b)
-    return Halfspaces(A.flatten(1, 2), b.flatten(1, 2))
-
-
-def _corners(box: BoxConfig) -> tuple[Tensor, Tensor]:
-    (lower,), (upper,) = box.corners(1)
-    return lower, upper

@@ -1,11 +1,6 @@
-r"""Runs of one robot among bodies with known paths: found once, without gradients, and then differentiated.
+"""Runs of one robot among bodies with known paths: found once, by compiled code, and differentiated by it.
 
-Compiled code finds the positions x_t, the controls u_t and their active rows. Given these rows, u_t is a formula of x_t
-and of the probe's position q_t. So all samples are one batch of one graph, and two vector-Jacobian products give all
-J_t = du_t/dx_t and K_t = du_t/dq_t. Let g_t and l_t be the derivatives of a loss with respect to u_t and x_t, with all
-that follows from these. Then from the last sample to the first
-
-    g_t = dL/du_t + dt l_(t+1),      l_t = dL/dx_t + l_(t+1) + J_t' g_t,      dL/dq_t = K_t' g_t.
+The code runs where the tensors are: on the CPU, or on a device with kernels.
 """
 
 from __future__ import annotations
@@ -17,132 +12,105 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from experiments.design.config import DesignConfig
-from torchfsid.halfspaces import array, dot
-from torchfsid.kernels.runs import run_to_goals
-from torchfsid.programmes.differentiable import times
-from torchfsid.robots.controller import CbfQpController
+from torchfsid import device
+from torchfsid.halfspaces import array
+from torchfsid.kernels.runs import return_to_path, run_to_goals
+from torchfsid.robots.avoidance import CollisionAvoidance
 from torchfsid.robots.measurement import Measurement
-from torchfsid.sets.derivatives import solution
+from torchfsid.robots.tasks import GoalTask
+
+Robot = tuple[float, float, tuple[float, bool, float, float]]
+"""The numbers of a robot, see `kernels.runs.run_to_goals`."""
 
 
 class Runs(NamedTuple):
-    """T samples of B robots among M bodies, without gradients.
+    """T samples of the B = P x S robots that go to S goals among P groups of M bodies, without gradients.
 
     Attributes:
+        goals: the goals [m].
+        around: positions of the bodies [m].
+        robot: the robot's numbers.
         x: positions [m].
         u: controls [m/s]; zero where infeasible.
-        bodies: positions of the bodies [m].
         rows: the active rows, each that of one body.
         filled: the places of `rows` that hold an active row.
         feasible: whether the QP had a solution.
     """
 
-    x: Float[Tensor, "T B 2"]
-    u: Float[Tensor, "T B 2"]
-    bodies: Float[Tensor, "T B M 2"]
-    rows: Int[Tensor, "T B 2"]
-    filled: Bool[Tensor, "T B 2"]
-    feasible: Bool[Tensor, "T B"]
+    goals: Float[Tensor, "S 2"]
+    around: Float[Tensor, "P T M 2"]
+    robot: Robot
+    x: Float[Tensor, "B T 2"]
+    u: Float[Tensor, "B T 2"]
+    rows: Int[Tensor, "B T 2"]
+    filled: Bool[Tensor, "B T 2"]
+    feasible: Bool[Tensor, "B T"]
 
-    def measurement(self, dt: float) -> Measurement:
-        """All samples as one measurement, in the order of time."""
-        (T, B, M, _), time = self.bodies.shape, dt * torch.arange(len(self.x), dtype=torch.float64)
+    @property
+    def bodies(self) -> Float[Tensor, "B T M 2"]:
+        """The positions of the bodies around each robot [m]."""
+        return self.around.repeat_interleave(len(self.goals), dim=0)
+
+    def measurement(self) -> Measurement:
+        """All samples as one measurement, robot by robot."""
+        bodies, (_, dt, _) = self.bodies, self.robot
+        time = dt * torch.arange(self.x.shape[1], dtype=torch.float64, device=self.x.device)
         return Measurement(
-            t=time.repeat_interleave(B),
+            t=time.repeat(len(self.x)),
             x=self.x.flatten(0, 1),
             u=self.u.flatten(0, 1),
-            bodies=self.bodies.flatten(0, 1),
-            present=torch.ones(T * B, M, dtype=torch.bool),
+            bodies=bodies.flatten(0, 1),
+            present=torch.ones(bodies.shape[:3], dtype=torch.bool, device=bodies.device).flatten(0, 1),
         )
+
+    def along(self, path: Float[Tensor, "P T 2"]) -> tuple[Float[Tensor, "B T 2"], Float[Tensor, "B T 2"]]:
+        """Positions and controls with their derivatives with respect to the path of the last body."""
+        return _Along.apply(path, self)  # type: ignore[return-value]
 
 
 def run(
-    config: DesignConfig, start: Float[Tensor, "2"], goals: Float[Tensor, "S 2"], bodies: Float[Tensor, "T P M 2"]
+    task: GoalTask,
+    avoidance: CollisionAvoidance,
+    start: Float[Tensor, "2"],
+    goals: Float[Tensor, "S 2"],
+    bodies: Float[Tensor, "P T M 2"],
+    dt: float,
 ) -> Runs:
     """Run the robot from `start` among every one of the P groups of bodies to every goal: P x S items."""
-    avoidance, class_k = config.avoidance, config.avoidance.class_k
-    x, u, rows, filled, feasible = map(
-        torch.from_numpy,
-        run_to_goals(
-            *map(array, (start, goals, bodies)), config.gain,
-            config.safety_distance, avoidance.distance == "squared", class_k.gain, class_k.power, config.dt,
-        ),
-    )  # fmt: skip
-    return Runs(x, u, bodies.repeat_interleave(len(goals), dim=1), rows, filled, feasible)
+    class_k, distance = avoidance.class_k, avoidance.safety_distance
+    assert distance is not None
+    keeping = float(distance), avoidance.distance == "squared", float(class_k.gain), float(class_k.power)
+    robot: Robot = float(task.gain), dt, keeping
+    shape = len(goals) * len(bodies), bodies.shape[1]
+    if device.has_kernels(start, goals, bodies):
+        kinds = torch.float64, torch.float64, torch.long, torch.bool
+        x, u, rows, filled = (device.empty((*shape, 2), start, kind) for kind in kinds)
+        feasible = device.empty(shape, start, torch.bool)
+        device.launch("runs.run_to_goals", ((start, goals, bodies),), robot, ((x, u, rows, filled, feasible),))
+    else:
+        found = run_to_goals(*map(array, (start, goals, bodies)), robot)
+        x, u, rows, filled, feasible = map(torch.from_numpy, found)
+    return Runs(goals, bodies, robot, x, u, rows, filled, feasible)
 
 
-def follow(
-    controller: CbfQpController,
-    theta: Float[Tensor, "B 2"],
-    runs: Runs,
-    probe: Float[Tensor, "T B 2"],
-    needed: Bool[Tensor, "T B"],
-    dt: float,
-) -> tuple[Float[Tensor, "T B 2"], Float[Tensor, "T B 2"]]:
-    """Positions and controls of the runs as functions of the probe's path, up to the last sample that is `needed`.
-
-    Args:
-        controller: the robot's controller.
-        theta: the goals [m].
-        runs: the runs. The probe is their last body.
-        probe: the probe's path [m], with gradients.
-        needed: the samples whose positions and controls are used.
-        dt: time between samples [s].
-    """
-    used = needed.flip(0).cummax(0).values.flip(0) & runs.feasible
-    du_dx, du_dq = probe.new_zeros(*used.shape, 2, 2), probe.new_zeros(*used.shape, 2, 2)
-    du_dx[used], du_dq[used] = _jacobians(controller, theta.expand_as(runs.x)[used], runs, used)
-    return _Run.apply(probe, runs.x, runs.u, du_dx, du_dq, dt)  # type: ignore[return-value]
-
-
-def _jacobians(
-    controller: CbfQpController, theta: Float[Tensor, "N 2"], runs: Runs, used: Bool[Tensor, "T B"]
-) -> tuple[Float[Tensor, "N 2 2"], Float[Tensor, "N 2 2"]]:
-    """The derivatives of u with respect to x and to the last body, for the samples `used`."""
-    rows, filled, bodies = runs.rows[used], runs.filled[used], runs.bodies[used]
-    x, near = runs.x[used].requires_grad_(), bodies.gather(1, rows.unsqueeze(-1).expand(-1, -1, 2)).requires_grad_()
-    with torch.enable_grad():
-        seen = Measurement(t=0.0, x=x, u=None, bodies=near, present=filled)
-        (safe_controls,), (C, d) = (barrier(seen) for barrier in controller.barriers), controller.task(seen)
-        uhat = times(C, theta) + d
-        # Two equations M u = right: an active row each, or no motion across them.
-        first, second = safe_controls.A.unbind(1)
-        along = torch.stack([-first[:, 1], first[:, 0]], dim=-1)
-        one, two = filled.unbind(-1)
-        M = torch.stack([first, torch.where(two.unsqueeze(-1), second, along)], dim=1)
-        M = torch.where(one[:, None, None], M, torch.eye(2, dtype=M.dtype))
-        right = torch.where(filled, safe_controls.b, dot(M, uhat.unsqueeze(-2)))
-        u = solution(runs.u[used], M, right, torch.ones_like(one))
-        parts = [torch.autograd.grad(part.sum(), (x, near), retain_graph=True) for part in u.unbind(-1)]
-    by_x, by_near = (torch.stack(part, dim=1) for part in zip(*parts, strict=True))
-    is_probe = filled & (rows == bodies.shape[1] - 1)
-    first, second = torch.where(is_probe[:, None, :, None], by_near, 0.0).unbind(2)
-    return by_x, first + second
-
-
-class _Run(torch.autograd.Function):
-    """(probe, x and u as numbers, du/dx, du/dq, dt) -> x and u as functions of the probe's path."""
+class _Along(torch.autograd.Function):
+    """(the path of the last body, the runs) -> x and u as functions of the path."""
 
     @staticmethod
-    def forward(
-        ctx: Any, probe: Tensor, x: Tensor, u: Tensor, du_dx: Tensor, du_dq: Tensor, dt: float
-    ) -> tuple[Tensor, Tensor]:
-        ctx.save_for_backward(du_dx, du_dq)
-        ctx.dt = dt
-        return x.clone(), u.clone()
+    def forward(ctx: Any, path: Tensor, runs: Runs) -> tuple[Tensor, Tensor]:
+        ctx.runs = runs
+        return runs.x.clone(), runs.u.clone()
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad_x: Tensor, grad_u: Tensor) -> tuple[Tensor | None, ...]:
-        du_dx, du_dq = ctx.saved_tensors
-        later, grads = torch.zeros_like(grad_x[0]), []
-        for J, of_x, of_u in zip(du_dx.flip(0), grad_x.flip(0), grad_u.flip(0), strict=True):
-            of_u = of_u + ctx.dt * later
-            later = later + of_x + _times(of_u, J)
-            grads.append(of_u)
-        return _times(torch.stack(grads).flip(0), du_dq), None, None, None, None, None
-
-
-def _times(v: Float[Tensor, "*B 2"], M: Float[Tensor, "*B 2 2"]) -> Float[Tensor, "*B 2"]:
-    return dot(v.unsqueeze(-2), M.mT)
+    def backward(ctx: Any, grad_x: Tensor, grad_u: Tensor) -> tuple[Tensor, None]:
+        goals, bodies, robot, *of_run = ctx.runs
+        if device.has_kernels(grad_x, grad_u, *of_run):
+            grad = device.empty(grad_x.shape, grad_x)
+            device.launch("runs.return_to_path", ((goals, bodies), of_run, (grad_x, grad_u)), robot, ((grad,),))
+        else:
+            run = tuple(map(array, of_run))
+            grad = torch.from_numpy(
+                return_to_path(array(goals), array(bodies), robot, run, array(grad_x), array(grad_u))
+            )
+        return grad.unflatten(0, (len(bodies), len(goals))).sum(1), None

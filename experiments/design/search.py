@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -24,6 +25,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from experiments.design.probe import Probing, expectation
+
+if TYPE_CHECKING:
+    from experiments.design.config import SearchConfig
 
 COARSEST = 1e-3
 """The Gaussian of the cross-entropy method keeps at least this standard deviation [m]."""
@@ -62,6 +66,7 @@ class Search:
 
     Attributes:
         probing: the scene.
+        settings: the settings of all methods.
         goals: the training goals [m].
         path: the predicted path [m].
         way_points: number of way-points.
@@ -69,16 +74,24 @@ class Search:
     """
 
     probing: Probing
+    settings: SearchConfig
     goals: Float[Tensor, "S 2"]
     path: Float[Tensor, "T 2"]
     way_points: int
     random: np.random.Generator
 
     @classmethod
-    def of(cls, probing: Probing, goals: Float[Tensor, "S 2"], way_points: int, seed: np.random.SeedSequence) -> Search:
+    def of(
+        cls,
+        probing: Probing,
+        settings: SearchConfig,
+        goals: Float[Tensor, "S 2"],
+        way_points: int,
+        seed: np.random.SeedSequence,
+    ) -> Search:
         """A search with random numbers from `seed`. The predicted path is the mean over goals, without a probe."""
-        path = probing.run(None, goals).x.mean(1)
-        return cls(probing, goals, path, way_points, np.random.default_rng(seed))
+        path = probing.run(None, goals).x.mean(0)
+        return cls(probing, settings, goals, path, way_points, np.random.default_rng(seed))
 
     def anywhere(self, count: int) -> Float[Tensor, "P K 2"]:
         """Way-points drawn uniformly from the room [m]."""
@@ -93,8 +106,7 @@ class Search:
         that time, with a radius a little above the safety distance. Each is turned some way around the ring from the
         one before.
         """
-        config, T, K = self.probing.config, len(self.path), self.way_points
-        spread = config.search.spread
+        spread, T, K = self.settings.spread, len(self.path), self.way_points
         if K == 1:
             at = torch.from_numpy(self.random.integers(T, size=(count, 1)))
             away = spread * torch.from_numpy(self.random.normal(size=(count, 1, 2)))
@@ -103,7 +115,7 @@ class Search:
         turns = self.random.normal(size=(count, K)) * TURN
         turns[:, 0] = self.random.uniform(0, 2 * np.pi, size=count)
         angle = torch.from_numpy(turns.cumsum(-1))
-        radius = config.safety_distance + spread * torch.from_numpy(self.random.normal(size=(count, K))).abs()
+        radius = self.probing.safety_distance + spread * torch.from_numpy(self.random.normal(size=(count, K))).abs()
         ring = radius.unsqueeze(-1) * torch.stack([angle.cos(), angle.sin()], dim=-1)
         return self.probing.allowed(self.path[at] + ring)
 
@@ -117,7 +129,7 @@ def drawn(draw: Callable[[Search, int], Tensor]) -> Callable[[Search], Evaluated
     """The method that evaluates placements drawn by `draw`, all in all `starts` x `steps`."""
 
     def method(search: Search) -> Evaluated:
-        found, settings = Evaluated(), search.probing.config.search
+        found, settings = Evaluated(), search.settings
         for _ in range(settings.steps):
             placements = draw(search, settings.starts)
             found.add(placements, search.evaluate(placements))
@@ -128,7 +140,7 @@ def drawn(draw: Callable[[Search, int], Tensor]) -> Callable[[Search], Evaluated
 
 def grid(search: Search) -> Evaluated:
     """The method that evaluates places on a grid of about square cells."""
-    found, settings = Evaluated(), search.probing.config.search
+    found, settings = Evaluated(), search.settings
     lower, upper = search.probing.room
     width, height = (upper - lower).tolist()
     columns = max(1, round((settings.starts * settings.steps * width / height) ** 0.5))
@@ -140,7 +152,7 @@ def grid(search: Search) -> Evaluated:
 
 def cem(search: Search) -> Evaluated:
     """The cross-entropy method (R. Rubinstein, 1999), axis by axis. Its first generation is near the predicted path."""
-    found, settings = Evaluated(), search.probing.config.search
+    found, settings = Evaluated(), search.settings
     elite = max(2, round(settings.elite * settings.starts))
     placements = search.near_path(settings.starts)
     for _ in range(settings.steps):
@@ -159,7 +171,7 @@ def adam(search: Search) -> Evaluated:
     chooses starts. The others go in equal shares to the best `starts`/2, the best half of these, and the best half
     again. The fewer starts are left, the more steps each has. The learning rate falls to zero.
     """
-    found, settings = Evaluated(), search.probing.config.search
+    found, settings = Evaluated(), search.settings
     for _ in range(max(settings.steps // 5, 1)):
         placements = search.near_path(settings.starts)
         found.add(placements, search.evaluate(placements))
@@ -196,7 +208,7 @@ def _descend(
         best = torch.where(better[:, None, None], placements.detach(), best)
         lowest = torch.where(better, means, lowest)
         optimiser.zero_grad()
-        expected = expectation(areas, search.probing.config.search.objective).sum()
+        expected = expectation(areas, search.settings.objective).sum()
         if expected.requires_grad:  # false if no placement changes anything
             expected.backward()
             optimiser.step()
@@ -216,7 +228,7 @@ METHODS: dict[str, Callable[[Search], Evaluated]] = {
 
 def choose(search: Search, found: Evaluated, goals: Float[Tensor, "S 2"]) -> Float[Tensor, "1 K 2"]:
     """The finalist with the smallest mean area over other goals."""
-    finalists = torch.cat(found.means).argsort()[: search.probing.config.search.finalists]
+    finalists = torch.cat(found.means).argsort()[: search.settings.finalists]
     placements = torch.cat(found.placements)[finalists]
     with torch.no_grad():
         best = search.probing.left(placements, goals).area.mean(-1).argmin()

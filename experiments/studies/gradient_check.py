@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from experiments.design.config import ProbePlacementConfig
+from experiments.design.config import GradientCheckConfig, ProbePlacementConfig
 from experiments.design.probe import Objective, Probing, expectation, slope
 from experiments.design.search import Search
 from experiments.kinds import Track
@@ -51,9 +51,9 @@ def check_gradients(config: ProbePlacementConfig, seed: np.random.SeedSequence, 
     rows = []
     for K, horizon in track(jobs, "Checking gradients", len(jobs)):
         goals = probing.draw_goals(settings.goals, int(seed.generate_state(1)[0]))
-        search = Search.of(probing, goals[:SCOUTS], K, seeds[config.way_points.index(K)])
-        placements = _fit_for_it(search, horizon)
-        rows += _check(probing, placements, goals, horizon) if len(placements) else []
+        search = Search.of(probing, config.search, goals[:SCOUTS], K, seeds[config.way_points.index(K)])
+        placements = _fit_for_it(search, settings, horizon)
+        rows += _check(probing, placements, goals, horizon, settings.step) if len(placements) else []
     return rows
 
 
@@ -66,7 +66,7 @@ def nothing_to_follow(config: ProbePlacementConfig, seed: np.random.SeedSequence
     probing, rows = Probing.of(config), []
     goals = probing.draw_goals(config.goals.train, int(seed.generate_state(1)[0]))
     for K, child in zip(config.way_points, seed.spawn(len(config.way_points)), strict=True):
-        search = Search.of(probing, goals, K, child)
+        search = Search.of(probing, config.search, goals, K, child)
         for drawn, draw in (("anywhere", search.anywhere), ("near_path", search.near_path)):
             placements = draw(CANDIDATES * DRAWS)
             zero, unsound = [], []
@@ -81,8 +81,7 @@ def nothing_to_follow(config: ProbePlacementConfig, seed: np.random.SeedSequence
     return rows
 
 
-def _fit_for_it(search: Search, horizon: int) -> Tensor:
-    settings = search.probing.config.gradient_check
+def _fit_for_it(search: Search, settings: GradientCheckConfig, horizon: int) -> Tensor:
     fit: list[Tensor] = []
     for _ in range(DRAWS):
         candidates = search.near_path(CANDIDATES)
@@ -112,8 +111,8 @@ class _Gradients(NamedTuple):
     differences: Tensor
 
 
-def _check(probing: Probing, placements: Tensor, goals: Tensor, horizon: int) -> list[dict[str, Any]]:
-    of_each = [_gradients(probing, placement.unsqueeze(0), goals, horizon) for placement in placements]
+def _check(probing: Probing, placements: Tensor, goals: Tensor, horizon: int, step: float) -> list[dict[str, Any]]:
+    of_each = [_gradients(probing, placement.unsqueeze(0), goals, horizon, step) for placement in placements]
     rows = []
     for objective in OBJECTIVES:
         together = _Gradients(*map(torch.cat, zip(*(of[objective] for of in of_each), strict=True)))
@@ -122,8 +121,9 @@ def _check(probing: Probing, placements: Tensor, goals: Tensor, horizon: int) ->
     return rows
 
 
-def _gradients(probing: Probing, placement: Tensor, goals: Tensor, horizon: int) -> dict[Objective, _Gradients]:
-    step = probing.config.gradient_check.step
+def _gradients(
+    probing: Probing, placement: Tensor, goals: Tensor, horizon: int, step: float
+) -> dict[Objective, _Gradients]:
     leaf = placement.clone().requires_grad_()
     area = probing.left(leaf, goals, horizon).area
     differences: dict[Objective, Tensor] = {objective: torch.zeros_like(placement) for objective in OBJECTIVES}

@@ -38,9 +38,8 @@ def across(probing: Probing, place: Float[Tensor, "2"], goal: Float[Tensor, "2"]
     slopes, y = slope(log_area.sum(), places)[:, 0, 1], places.detach()[:, 0, 1]
     log_area = log_area.detach()
     with torch.no_grad():
-        seen = probing.run(places, goals).measurement(probing.config.dt)
-        active = evidence(probing.model, probing.prior_of(len(places)), seen).kkt.active
-        history = active.unflatten(0, (-1, len(places))).transpose(0, 1)
+        seen = probing.run(places, goals).measurement()
+        history = evidence(probing.model, probing.prior_of(1), seen).kkt.active.unflatten(0, (len(places), -1))
     switched = (history[1:] != history[:-1]).flatten(1).any(-1).long()
     columns = {
         "y": y,

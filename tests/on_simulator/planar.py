@@ -23,6 +23,7 @@ from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.measurement import Measurement
 from torchfsid.robots.tasks import GoalTask, Saturation
 from torchfsid.sets.feasible_set import FeasibleSet
+from torchfsid.sets.polygon import Polygon
 
 pytestmark = pytest.mark.filterwarnings("ignore:divide by zero")  # in Python, a row 0.z <= -1 is noticed
 
@@ -73,6 +74,17 @@ def test_full_rings_are_merged_alike() -> None:
     assert int(other.body.count.max()) == 6
 
 
+def cut_by_hand(square: Polygon, A: torch.Tensor, b: torch.Tensor) -> tuple[list, torch.Tensor, torch.Tensor]:
+    """The polygons that the kernel fills, with as many slots, whether they are smaller, and the list of the late."""
+    B, nothing = len(b), torch.zeros(len(b), 3, dtype=torch.float64)
+    parts = [torch.full_like(part, -7) for part in square.fields()[:7]]
+    found, late = (torch.zeros(B).long(), torch.zeros(B, dtype=torch.bool)), torch.zeros(B + 1, dtype=torch.int32)
+    lost = nothing.unsqueeze(-1).repeat(1, 1, 2), nothing.clone(), nothing.clone(), nothing.long()
+    rows = A, b, torch.zeros(1, 1, dtype=torch.float64), torch.zeros_like(b).long()
+    device.launch("planar.clip", (square.fields(), rows), (32, False), ((*parts, square.reach), found, lost, (late,)))
+    return parts, found[1], late
+
+
 def test_a_ring_that_does_not_fit_stays_as_it_was() -> None:
     """Neither more edges than slots, nor a smaller set than is true."""
     corner = torch.ones(3, 2, dtype=torch.float64)
@@ -80,21 +92,27 @@ def test_a_ring_that_does_not_fit_stays_as_it_was() -> None:
     A, b = torch.ones(3, 1, 2, dtype=torch.float64), torch.ones(3, 1, dtype=torch.float64)
     A[1] = A[1] * torch.tensor([1.0, 0.0])
     b[1] = 0.5
-    parts = [torch.empty_like(part) for part in square.fields()[:7]]
-    found = torch.empty(3, dtype=torch.long), torch.empty(3, dtype=torch.bool)
-    lost = (
-        torch.empty(3, 3, 2).double(),
-        torch.empty(3, 3).double(),
-        torch.empty(3, 3).double(),
-        torch.ones(3, 3).long(),
-    )
-    rows = A, b, torch.zeros_like(b), torch.zeros_like(b).long()
-    device.launch("planar.clip", (square.fields(), rows), (32, False), ((*parts, square.reach), found, lost))
-    assert found[1].tolist() == [False, True, False]
+    parts, shrunk, late = cut_by_hand(square, A, b)
+    assert shrunk.tolist() == [False, True, False]
+    assert late.tolist() == [0, 0, 0, 0]
     assert parts[6].tolist() == [4, 4, 4]
     for part, before in zip(parts, square.fields()[:7], strict=True):
         same(part[::2], before[::2])
     assert parts[0][1, :, 0].max() == 0.5
+
+
+def test_polygons_with_many_cuts_are_late() -> None:
+    """The same row five times is five cuts, of which the first is the only one that removes anything."""
+    corner = torch.ones(70, 2, dtype=torch.float64)
+    square = FeasibleSet.from_box(-corner, corner).body
+    A, b = torch.tensor([1.0, 0.0]).double().repeat(70, 5, 1), torch.full((70, 5), 9.0).double()
+    b[1], b[66], b[2, 0] = 0.5, 0.5, 0.5
+    parts, shrunk, late = cut_by_hand(square, A, b)
+    assert late[0] == 2
+    assert set(late[1:3].tolist()) == {1, 66}
+    assert shrunk.nonzero().flatten().tolist() == [1, 2, 66]
+    same(parts[0][..., 0].amax(1), torch.where(shrunk, 0.5, 1.0).double())
+    assert (parts[6] == 4).all()
 
 
 def test_emptiness_comes_with_its_proof() -> None:
@@ -140,11 +158,13 @@ def same_evidence(one: Evidence, other: Evidence) -> None:
 @pytest.mark.parametrize("kind", ["inverse_optimal", "critical_region"])
 @pytest.mark.parametrize("errors", [False, True], ids=["exact positions", "position errors"])
 @pytest.mark.parametrize("count", SIZES)
-def test_measurements_are_read_alike(kind: str, errors: bool, count: int) -> None:
+def test_measurements_are_read_alike(kind: str, errors: bool, count: int, launched: list[str]) -> None:
     rng = np.random.default_rng(1)
     chosen = [random_scene(rng, int(rng.integers(1, 7)), crowded=0.3) for _ in range(count)]
     one, other = both(lambda: scenes.both(kind, chosen, errors)[1])
+    assert launched == ["planar.evidence"]  # slacks and KKT conditions follow when they are asked for
     same_evidence(one, other)
+    assert launched == ["planar.evidence", "planar.details"]
 
 
 def test_relaxed_rows_are_read_alike(monkeypatch: pytest.MonkeyPatch) -> None:

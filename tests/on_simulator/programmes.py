@@ -12,7 +12,8 @@ from torch.autograd import gradcheck, gradgradcheck
 
 from benchmarks import cuda_layers
 from tests.hard_sets import hard_sets, padded
-from tests.on_simulator._both import SIZES, Waits, both, launched, same
+from tests.on_simulator._both import SIZES, both, launched, same
+from tests.round_trips import RoundTrips
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.kernels import programmes as kernel
 from torchfsid.outcome import Status
@@ -128,14 +129,15 @@ def test_batches_of_any_shape() -> None:
 def test_the_host_waits_once(layer: str) -> None:
     """For the number of items that could not be verified, and not at all in the gradients."""
     leaves = [part.requires_grad_() for part in drawn(4, 5, 2)]
-    ProjectOnto()(Halfspaces(*leaves[:2]), leaves[2])  # compiled
-    with Waits() as forward:
+    found = answers(layer, *leaves)  # compiles, and copies constants
+    torch.autograd.grad(found[0].nansum(), leaves, create_graph=True, allow_unused=True)
+    with RoundTrips() as forward:
         found = answers(layer, *leaves)
-    assert forward.for_ops == ["nonzero"]
+    assert [name for *_, name in forward.waits] == ["nonzero"]
     for graph in (False, True):
-        with Waits() as backward:
+        with RoundTrips() as backward:
             torch.autograd.grad(found[0].nansum(), leaves, create_graph=graph, retain_graph=True, allow_unused=True)
-        assert backward.for_ops == []
+        assert not backward.waits
 
 
 @LAYERS

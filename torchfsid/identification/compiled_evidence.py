@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from functools import cache, partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -23,8 +24,11 @@ NO_CLIP = (np.empty(0), False, 0.0, np.empty((0, 0, 2)))
 """`clip` of `kernels.evidence` for nominal controls that are not clipped."""
 
 
-Read = tuple[Halfspaces, Any, KktSolution]
-"""The half-spaces, the fields of `Evidence` from `informative` to `excess`, and the KKT conditions."""
+Details = Callable[[], tuple[Tensor, Tensor, KktSolution]]
+"""Computes slack and excess, as in `Evidence`, and the KKT conditions."""
+
+Read = tuple[Halfspaces, tuple[Tensor, Tensor, Tensor], Details]
+"""The half-spaces, the fields `informative`, `alarmed` and `infeasible` of `Evidence`, and the other ones."""
 
 
 def can_be_compiled(model: ObservationModel, sample: Sample, wanted: bool | None) -> bool:
@@ -43,7 +47,7 @@ def can_be_compiled(model: ObservationModel, sample: Sample, wanted: bool | None
         obstacle = "controls are neither in the plane nor in space"
     elif clipped and not sample.rows.dim == sample.C.shape[-1] == 2:
         obstacle = "the nominal control is clipped, and theta is not planar"
-    elif in_space and bool(sample.relaxed.any()):
+    elif in_space and model.relaxes:
         obstacle = "rows are relaxed, in space"
     elif torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
         obstacle = "gradients are required"
@@ -82,17 +86,19 @@ def read(model: ObservationModel, sample: Sample) -> Read:
             clip = limits, saturation.shape == "norm", float(saturation.dead_speed), array(sample.corners)
         found = kernel.evidence(*map(array, rows + relaxed + others), clip, paper, model.active_tolerance)
     half_spaces, judged, kkt = found
-    solved = KktSolution(*map(torch.from_numpy, kkt))
-    return Halfspaces(*map(torch.from_numpy, half_spaces)), tuple(map(torch.from_numpy, judged)), solved
+    informative, alarmed, infeasible, slack, excess = map(torch.from_numpy, judged)
+    details = slack, excess, KktSolution(*map(torch.from_numpy, kkt))
+    return Halfspaces(*map(torch.from_numpy, half_spaces)), (informative, alarmed, infeasible), lambda: details
 
 
 def _read_on_device(model: ObservationModel, sample: Sample) -> Read:
+    """What the device's kernels say. Slacks and KKT conditions are computed when they are asked for."""
     paper, saturation, u = model.kind == "critical_region", model.task.saturation, sample.u
-    (B, m, _), p = sample.rows.A.shape, sample.C.shape[-1]
+    (B, m, _), p, bound = sample.rows.A.shape, sample.C.shape[-1], torch.atleast_2d(sample.bound)
     given = (
         (sample.rows.A, sample.rows.b, sample.hard, sample.relaxed),
         (sample.C, sample.d, u, sample.usable),
-        (torch.atleast_2d(sample.bound), torch.atleast_1d(sample.ball), torch.atleast_1d(sample.drift)),
+        (bound, torch.atleast_1d(sample.ball), torch.atleast_1d(sample.drift)),
         () if sample.row_errors is None else (sample.row_errors.angle,),
         () if saturation is None or sample.corners is None else (sample.corners,),
     )
@@ -100,11 +106,19 @@ def _read_on_device(model: ObservationModel, sample: Sample) -> Read:
     if saturation is not None:
         clip = *map(float, saturation.limits), saturation.shape == "norm", float(saturation.dead_speed)
     R = kernel.rows_for(m, paper, clip is not None)
-    real, boolean, long = torch.float64, torch.bool, torch.long
-    half_spaces = (((B, R, p), real), ((B, R), real), ((B, R), long))
-    judged = (((B,), boolean),) * 3 + (((B, m), real),) * 2
-    matrices = ((B, 2, p), real), ((B, 2), real), ((B, 2, 2), real), ((B, 2, 2), real), ((B, 2), real)
-    kkt = *matrices, ((B, m), boolean), *(((B,), long),) * 3
-    results = [[device.empty(shape, u, dtype) for shape, dtype in part] for part in (half_spaces, judged, kkt)]
-    device.launch("planar.evidence", given, (paper, model.active_tolerance, clip), results)
-    return Halfspaces(*results[0]), tuple(results[1]), KktSolution(*results[2])
+    half_spaces = device.empty((B, R, p), u), device.empty((B, R), u), device.empty((B, R), u, torch.long)
+    informative, alarmed, infeasible = (device.empty((B,), u, torch.bool) for _ in range(3))
+    judged = informative, alarmed, infeasible
+    device.launch("planar.evidence", given, (paper, model.active_tolerance, clip), (half_spaces, judged))
+    return Halfspaces(*half_spaces), judged, cache(partial(_details_on_device, model.active_tolerance, sample))
+
+
+def _details_on_device(tolerance: float, sample: Sample) -> tuple[Tensor, Tensor, KktSolution]:
+    (B, m, _), p, u, long = sample.rows.A.shape, sample.C.shape[-1], sample.u, torch.long
+    slack, excess = device.empty((B, m), u), device.empty((B, m), u)
+    matrices = [device.empty(shape, u) for shape in ((B, 2, p), (B, 2), (B, 2, 2), (B, 2, 2), (B, 2))]
+    solved = *matrices, device.empty((B, m), u, torch.bool), *(device.empty((B,), u, long) for _ in range(3))
+    rows = sample.rows.A, sample.rows.b, sample.hard, sample.relaxed
+    given = rows, (sample.C, sample.d, u), (torch.atleast_2d(sample.bound),)
+    device.launch("planar.details", given, (tolerance,), ((slack, excess), solved))
+    return slack, excess, KktSolution(*solved)

@@ -6,17 +6,24 @@ r"""The paper's instantaneous feasible set Omega: every theta whose QP has the o
 One formula covers cases A-E (G., Eqs. (19), (29), (44), (47), (54)). The "floating" eta of cases C and E, quantified by
 "if there exists eta", is exactly membership in this cone. The set depends on the active rows only, not on the measured
 control. It equals the critical region of multiparametric quadratic programming.
+
+In the plane it is computed by compiled code, with its first derivatives (`kernels.regions`).
 """
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchfsid.halfspaces import Halfspaces, dot
-from torchfsid.identification.kkt import KktSolution, solve_kkt
+from torchfsid.device import on_host
+from torchfsid.halfspaces import Halfspaces, array, dot
+from torchfsid.identification.kkt import KktSolution, require_fit, solve_unit
 from torchfsid.identification.normals import outward_normals
+from torchfsid.kernels import regions
 from torchfsid.tolerances import CRITICAL_NORMALS, RANK_TOLERANCE
 
 
@@ -34,8 +41,47 @@ def critical_region(
     Raises:
         InputError: shapes do not fit, or controls are neither in the plane nor in space.
     """
-    C, d = C.to(torch.float64), d.to(torch.float64)
-    return region_of(safe_controls.normalised(), solve_kkt(safe_controls, active, C, d), C, d)
+    C, d, m = C.to(torch.float64), d.to(torch.float64), safe_controls.rows
+    require_fit(safe_controls, active, C, d)
+    tensors = safe_controls.A, safe_controls.b, active, C, d
+    if m == 0 or safe_controls.dim != 2 or not on_host(*tensors) or torch._C._are_functorch_transforms_active():
+        return _in_torch(*tensors)
+    inner = 2, 1, 1, 2, 1
+    batch = np.broadcast_shapes(*(t.shape[:-n] for t, n in zip(tensors, inner, strict=True)))
+    flat = (t.expand(*batch, *t.shape[-n:]).reshape(-1, *t.shape[-n:]) for t, n in zip(tensors, inner, strict=True))
+    A, b, source = (part.reshape(*batch, *part.shape[1:]) for part in _Region.apply(*flat))  # type: ignore[union-attr]
+    return Halfspaces(A, b, source)
+
+
+def _in_torch(A: Tensor, b: Tensor, active: Tensor, C: Tensor, d: Tensor) -> Halfspaces:
+    unit = Halfspaces(A, b).normalised()
+    return region_of(unit, solve_unit(unit, active, C, d), C, d)
+
+
+class _Region(torch.autograd.Function):
+    """(A, b, active, C, d) -> A, b and source of the region. First derivatives are compiled, others are torch's."""
+
+    @staticmethod
+    def forward(ctx: Any, *tensors: Tensor) -> tuple[Tensor, ...]:
+        found = tuple(map(torch.from_numpy, regions.critical_regions(*map(array, tensors))))
+        ctx.save_for_backward(*tensors)
+        ctx.mark_non_differentiable(found[2])
+        return found
+
+    @staticmethod
+    def backward(ctx: Any, grad_A: Tensor, grad_b: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+        tensors = ctx.saved_tensors
+        if not torch.is_grad_enabled():
+            found = regions.critical_regions_vjp(*map(array, (*tensors, grad_A, grad_b)))
+            of_A, of_b, of_C, of_d = map(torch.from_numpy, found)
+            return of_A, of_b, None, of_C, of_d
+        region = _in_torch(*tensors)  # second derivatives are wanted
+        leaves = [tensor for tensor in tensors if tensor.requires_grad]
+        found = torch.autograd.grad(
+            (region.A, region.b), leaves, (grad_A, grad_b), create_graph=True, materialize_grads=True
+        )
+        grads = iter(found)
+        return tuple(next(grads) if tensor.requires_grad else None for tensor in tensors)
 
 
 def region_of(

@@ -31,6 +31,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchfsid.device import all_seen, constant, on_host
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, dot, finite
 from torchfsid.identification import compiled_evidence
@@ -91,10 +92,23 @@ class ObservationModel:
         if not self.active_tolerance > 0:
             raise InputError("active_tolerance", "a positive number [units of the control]", self.active_tolerance)
 
+    @cached_property
+    def bounds(self) -> NoiseBound:
+        """The declared bounds. The critical region without any needs the slack of its active rows only."""
+        return NoiseBound(0.0, self.active_tolerance) if self.noise is None else self.noise
+
+    @cached_property
+    def relaxes(self) -> bool:
+        """Does the controller take the least violation of rows that are infeasible (`Barrier.relaxes`)?"""
+        return any(getattr(barrier, "relaxes", False) for barrier in self.barriers)
+
 
 @dataclass(frozen=True)
 class Evidence:
     """What one measurement says by itself.
+
+    Slacks and KKT conditions are computed when they are first used. On a device this is done from the tensors of the
+    measurement, so that these must not be changed in place before.
 
     Attributes:
         omega: half-spaces of theta, all padding where the sample is not used. Their sources are those of
@@ -102,9 +116,8 @@ class Evidence:
         informative: whether the sample is used.
         alarmed: whether it is not used because a hard row is violated beyond its bound.
         infeasible: whether it is not used because the controller may have found its rows infeasible and relaxed them.
-        slack: the slack of every row at the measured control, in its units.
-        excess: the violation of every row beyond its bound, in these units; positive if it is violated.
         hard: the rows that no controller may violate.
+        slacks: computes `slack` and `excess`. Use these instead.
         solve: solves the KKT conditions. Use `kkt` instead.
         omega_without: the half-spaces of theta for k items if a row of each were inactive: called with (items, rows).
     """
@@ -113,11 +126,24 @@ class Evidence:
     informative: Bool[Tensor, "B"]
     alarmed: Bool[Tensor, "B"]
     infeasible: Bool[Tensor, "B"]
-    slack: Float[Tensor, "B m"]
-    excess: Float[Tensor, "B m"]
     hard: Bool[Tensor, "m"]
+    slacks: Callable[[], tuple[Tensor, Tensor]]
     solve: Callable[[], KktSolution]
     omega_without: Callable[[Int[Tensor, "k"], Int[Tensor, "k"]], Halfspaces]
+
+    @cached_property
+    def _measured(self) -> tuple[Tensor, Tensor]:
+        return self.slacks()
+
+    @property
+    def slack(self) -> Float[Tensor, "B m"]:
+        """The slack of every row at the measured control, in its units."""
+        return self._measured[0]
+
+    @property
+    def excess(self) -> Float[Tensor, "B m"]:
+        """The violation of every row beyond its bound, in its units; positive if it is violated."""
+        return self._measured[1]
 
     @cached_property
     def kkt(self) -> KktSolution:
@@ -129,8 +155,9 @@ class Evidence:
         source = None if self.omega.source is None else self.omega.source[items]
         return Evidence(
             Halfspaces(self.omega.A[items], self.omega.b[items], source), self.informative[items],
-            self.alarmed[items], self.infeasible[items], self.slack[items], self.excess[items], self.hard,
-            lambda: self.kkt.select(items), lambda chosen, rows: self.omega_without(items[chosen], rows),
+            self.alarmed[items], self.infeasible[items], self.hard,
+            lambda: (self.slack[items], self.excess[items]), lambda: self.kkt.select(items),
+            lambda chosen, rows: self.omega_without(items[chosen], rows),
         )  # fmt: skip
 
 
@@ -210,9 +237,9 @@ def read_sample(model: ObservationModel, sample: Sample, compiled: bool | None) 
     """`evidence` of a sample that is already evaluated."""
     if not compiled_evidence.can_be_compiled(model, sample, compiled):
         return _in_torch(model, sample)
-    omega, (informative, alarmed, infeasible, slack, excess), solved = compiled_evidence.read(model, sample)
+    omega, judged, details = compiled_evidence.read(model, sample)
     return Evidence(
-        omega, informative, alarmed, infeasible, slack, excess, sample.hard, lambda: solved, sample.omega_without(model)
+        omega, *judged, sample.hard, lambda: details()[:2], lambda: details()[2], sample.omega_without(model)
     )
 
 
@@ -223,15 +250,15 @@ def sample_of(model: ObservationModel, theta: FeasibleSet, measurement: Measurem
     if measurement.x.ndim != 2 or len(theta.batch_shape) != 1 or items % max(robots, 1) != 0:
         expected = f"a batch of {tuple(theta.batch_shape)} robots, or several of them"
         raise InputError("measurement", expected, tuple(measurement.x.shape))
-    noise = NoiseBound(0.0, model.active_tolerance) if model.noise is None else model.noise.of_samples(robots, items)
+    noise = model.bounds.of_samples(robots, items)
     errors, of_rows, corners = ErrorBounds.of(measurement, noise), None, None
     if errors is None and any(getattr(barrier, "uncertain", False) for barrier in model.barriers):
         errors = ErrorBounds.of_controls(measurement, noise)
     parts = [possible_rows(barrier, measurement, errors) for barrier in model.barriers]
     rows, (C, d) = Halfspaces.stack(parts), model.task(measurement)
     owners = [barrier for barrier, part in zip(model.barriers, parts, strict=True) for _ in range(part.rows)]
-    hard = torch.tensor([not barrier.soft for barrier in owners], dtype=torch.bool, device=u.device)
-    relaxed = torch.tensor([getattr(b, "relaxes", False) for b in owners], dtype=torch.bool, device=u.device)
+    hard = constant(tuple(not barrier.soft for barrier in owners), u.device, torch.bool)
+    relaxed = constant(tuple(getattr(barrier, "relaxes", False) for barrier in owners), u.device, torch.bool)
 
     bound, ball, drift = per_row(noise.slack, u), per_row(noise.velocity, u).squeeze(-1), u.new_zeros(())
     if measurement.velocity_error is not None:
@@ -251,7 +278,7 @@ def sample_of(model: ObservationModel, theta: FeasibleSet, measurement: Measurem
     if measurement.observed is not None:
         usable = usable & measurement.observed
     if measurement.left_out is not None:
-        error = torch.as_tensor(2 * noise.position).to(u)
+        error = u.new_zeros(()) + 2 * noise.position
         if measurement.position_error is not None:
             error = error + measurement.position_error
         usable = usable & left_out_inactive(model.barriers, within_bounds(measurement, noise), largest, error)
@@ -263,7 +290,7 @@ def sample_of(model: ObservationModel, theta: FeasibleSet, measurement: Measurem
         if errors is not None:
             ball = ball + model.task.feedback_error(errors)  # type: ignore[attr-defined]
 
-    turned = of_rows if of_rows is not None and bool((of_rows.angle > 0).any()) else None
+    turned = None if of_rows is None or all_seen(of_rows.angle == 0) else of_rows
     return Sample(
         rows, hard, relaxed, u, C.to(torch.float64), d.to(torch.float64), usable, bound, ball, drift, turned, corners,
     )  # fmt: skip
@@ -271,7 +298,7 @@ def sample_of(model: ObservationModel, theta: FeasibleSet, measurement: Measurem
 
 def _in_torch(model: ObservationModel, sample: Sample) -> Evidence:
     rows, C, d, usable, u = sample.rows, sample.C, sample.d, sample.usable, sample.u
-    if not finite(rows.A, rows.b, C, d):  # padding and zeros in place of what could not be evaluated
+    if not (on_host(u) and finite(rows.A, rows.b, C, d)):  # padding and zeros in place of what could not be evaluated
         are_known = rows.b.isfinite() & rows.A.isfinite().all(-1)
         wish_known = C.isfinite().all(-1).all(-1) & d.isfinite().all(-1)
         C, d = torch.where(wish_known[:, None, None], C, 0.0), torch.where(wish_known[:, None], d, 0.0)
@@ -282,7 +309,7 @@ def _in_torch(model: ObservationModel, sample: Sample) -> Evidence:
     excess, near = -slack - room, slack <= room
     alarmed, infeasible = usable & ((excess > 0) & sample.hard).any(-1), torch.zeros_like(usable)
     outward = None if model.kind == "critical_region" else normals_of(unit, near, sample.row_errors)
-    if outward is not None and bool(sample.relaxed.any()):
+    if outward is not None and model.relaxes:
         strained = ((excess > 0) & sample.relaxed).any(-1)
         alarmed = alarmed | usable & strained & (outward.opening > RELAXED_OPENING)
         infeasible = usable & ~alarmed & (strained | (outward.opening == 0))
@@ -300,5 +327,6 @@ def _in_torch(model: ObservationModel, sample: Sample) -> Evidence:
         )  # fmt: skip
     omega = omega.where(informative.unsqueeze(-1))
     return Evidence(
-        omega, informative, alarmed, infeasible, slack, excess, sample.hard, solve, sample.omega_without(model)
-    )
+        omega, informative, alarmed, infeasible, sample.hard, lambda: (slack, excess), solve,
+        sample.omega_without(model),
+    )  # fmt: skip

@@ -127,7 +127,7 @@ def without_direction(unit: Halfspaces, row_errors: RowErrors) -> Bool[Tensor, "
 
 def per_row(bound: float | Float[Tensor, "*batch"], like: Tensor) -> Float[Tensor, "*batch 1"]:
     """A bound of `NoiseBound` as a tensor that broadcasts with the rows of a batch."""
-    return torch.as_tensor(bound, dtype=like.dtype, device=like.device).unsqueeze(-1)
+    return (bound.to(like) if isinstance(bound, Tensor) else like.new_full((), bound)).unsqueeze(-1)
 
 
 def _fan(

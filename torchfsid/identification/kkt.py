@@ -82,12 +82,21 @@ def solve_kkt(
     Raises:
         InputError: shapes of `active`, `C`, `d` do not fit the rows.
     """
+    require_fit(safe_controls, active, C, d)
+    return solve_unit(safe_controls.normalised(), active, C.to(torch.float64), d.to(torch.float64))
+
+
+def require_fit(safe_controls: Halfspaces, active: Tensor, C: Tensor, d: Tensor) -> None:
+    """Check the shapes of the arguments of `solve_kkt`.
+
+    Raises:
+        InputError: they do not fit the rows.
+    """
     m, n = safe_controls.rows, safe_controls.dim
     if active.shape[-1] != m:
         raise InputError("active", f"(*batch, {m})", tuple(active.shape))
     if C.shape[-2] != n or d.shape[-1] != n:
         raise InputError("C, d", f"C (*batch, {n}, p) and d (*batch, {n})", (tuple(C.shape), tuple(d.shape)))
-    return solve_unit(safe_controls.normalised(), active, C.to(torch.float64), d.to(torch.float64))
 
 
 def solve_unit(

@@ -1,11 +1,7 @@
-r"""One measurement of many planar robots in scalar code: slacks, KKT conditions and half-spaces of theta.
+"""One measurement of many planar robots in scalar code: slacks, KKT conditions (`kkt`) and half-spaces of theta.
 
 This computes what `identification` computes in torch, one robot after the other. The theory is explained there, and
-tests compare the two. The active rows A_a, of unit length, are solved along their principal axes. Let V be the rotation
-to these axes. The columns of A_a V = [y z] are orthogonal up to round-off, and w = z - y (y.z)/(y.y) has the length of
-the second singular value. Then
-
-    A_a^+ b_a = V [c1, c2],    c2 = w.b/w.w,   c1 = (y.b - c2 y.z)/y.y        (rank 2; at rank 1, y alone is used).
+tests compare the two.
 """
 
 from __future__ import annotations
@@ -16,6 +12,7 @@ from typing import no_type_check
 import numpy as np
 
 from torchfsid.kernels.compiled import item, launcher
+from torchfsid.kernels.kkt import solve_one
 from torchfsid.kernels.saturation import ROWS, clipped_inverse_optimal, workspace
 from torchfsid.tolerances import (
     ANGLE_TOLERANCE,
@@ -46,8 +43,8 @@ def is_finite(k, C, d):
 
 @item
 @no_type_check
-def judge(k, A, b, hard, relaxed, u, bound, angles, active_tolerance, unit, unit_b, slack, excess, active, near):
-    """Fill the unit rows, the slacks, the active rows and those that may be active (`near`).
+def judge(k, o, A, b, hard, relaxed, u, bound, angles, active_tolerance, unit, unit_b, slack, excess, active, near):
+    """Fill the unit rows, the slacks, the active rows and those that may be active (`near`), at place o of the results.
 
     Returns:
         Four answers: whether all rows are finite, whether a hard row and whether a relaxed row is violated beyond its
@@ -72,71 +69,14 @@ def judge(k, A, b, hard, relaxed, u, bound, angles, active_tolerance, unit, unit
         unit[j, 0], unit[j, 1], unit_b[j] = p, q, c
         s = c - (p * u[k, 0] + q * u[k, 1])
         room = bound[of_bound, min(j, least)] + ROUND_OFF * (abs(p * u[k, 0]) + abs(q * u[k, 1]) + abs(c))
-        slack[k, j], excess[k, j] = s, -s - room
-        active[k, j] = is_row and abs(s) < active_tolerance
+        over = -s - room
+        slack[o, j], excess[o, j] = s, over
+        active[o, j] = is_row and abs(s) < active_tolerance
         near[j] = is_row and s <= room
-        broken, strained = broken or (hard[j] and excess[k, j] > 0), strained or (relaxed[j] and excess[k, j] > 0)
+        broken, strained = broken or (hard[j] and over > 0), strained or (relaxed[j] and over > 0)
         if uncertain and s <= room:
             blind = blind or angles[k, j] >= PI or (angles[k, j] > 0 and not is_row)
     return known, broken, strained, blind
-
-
-@item
-@no_type_check
-def solve_active(k, unit, unit_b, active, offset, projector):
-    """Fill A_a^+ b_a and A_a^+ A_a for the active rows. Returns their number K and their rank."""
-    K, p, q, r = 0, 0.0, 0.0, 0.0
-    for j in range(len(unit_b)):
-        if active[k, j]:
-            K += 1
-            p, q, r = p + unit[j, 0] ** 2, q + unit[j, 0] * unit[j, 1], r + unit[j, 1] ** 2
-    if K == 0:
-        return 0, 0
-    turn = math.atan2(2 * q, p - r) / 2
-    cos, sin = math.cos(turn), math.sin(turn)
-    yy = yz = yb = ww = wb = v0 = v1 = 0.0
-    for j in range(len(unit_b)):
-        if active[k, j]:
-            y, z = cos * unit[j, 0] + sin * unit[j, 1], cos * unit[j, 1] - sin * unit[j, 0]
-            yy, yz, yb = yy + y * y, yz + y * z, yb + y * unit_b[j]
-            v0, v1 = v0 + y * unit[j, 0], v1 + y * unit[j, 1]
-    for j in range(len(unit_b)):
-        if active[k, j]:
-            y, z = cos * unit[j, 0] + sin * unit[j, 1], cos * unit[j, 1] - sin * unit[j, 0]
-            w = z - y * yz / yy
-            ww, wb = ww + w * w, wb + w * unit_b[j]
-    if ww > RANK_TOLERANCE**2 * yy:
-        second = wb / ww
-        first = (yb - yz * second) / yy
-        offset[k, 0], offset[k, 1] = cos * first - sin * second, sin * first + cos * second
-        projector[k, 0, 0] = projector[k, 1, 1] = 1.0
-        return K, 2
-    length = math.sqrt(v0 * v0 + v1 * v1)
-    v0, v1 = v0 / length, v1 / length
-    yy = yb = 0.0
-    for j in range(len(unit_b)):
-        if active[k, j]:
-            y = unit[j, 0] * v0 + unit[j, 1] * v1
-            yy, yb = yy + y * y, yb + y * unit_b[j]
-    offset[k, 0], offset[k, 1] = v0 * yb / yy, v1 * yb / yy
-    projector[k, 0, 0], projector[k, 1, 1] = v0 * v0, v1 * v1
-    projector[k, 0, 1] = projector[k, 1, 0] = v0 * v1
-    return K, 1
-
-
-@item
-@no_type_check
-def solve_motion(k, C, d, wish_known, rank, offset, projector, free, G, f):
-    """Fill G and f of u* = G theta + f, and free = I - P, which is exactly zero at full rank."""
-    if rank < 2:
-        free[k, 0, 0], free[k, 1, 1] = 1 - projector[k, 0, 0], 1 - projector[k, 1, 1]
-        free[k, 0, 1], free[k, 1, 0] = -projector[k, 0, 1], -projector[k, 1, 0]
-    for i in range(2):
-        f[k, i] = offset[k, i]
-        if wish_known:
-            f[k, i] += free[k, i, 0] * d[k, 0] + free[k, i, 1] * d[k, 1]
-            for e in range(C.shape[2]):
-                G[k, i, e] = free[k, i, 0] * C[k, 0, e] + free[k, i, 1] * C[k, 1, e]
 
 
 @item
@@ -216,27 +156,31 @@ def find_generators(k, unit, chosen, angles, angle, order):
 @item
 @no_type_check
 def critical_region(
-    k, unit, unit_b, C, d, G, f, P, offset, active, normals, generator, count, row_A, row_b, row_source
+    k, o, unit, unit_b, C, d, G, f, P, offset, active, normals, generator, count, row_A, row_b, row_source
 ):
-    """The rows of `identification.critical_region` that are not padding."""
+    """The rows of `identification.critical_region` that are not padding. Returns their number.
+
+    The KKT conditions are those at place o.
+    """
     m, R, least = len(unit_b), 0, RANK_TOLERANCE**2
     for j in range(m):
         p, q = unit[j, 0], unit[j, 1]
-        across = (p - p * P[k, 0, 0] - q * P[k, 1, 0]) ** 2 + (q - p * P[k, 0, 1] - q * P[k, 1, 1]) ** 2
-        if not active[k, j] and across > least:
+        across = (p - p * P[o, 0, 0] - q * P[o, 1, 0]) ** 2 + (q - p * P[o, 0, 1] - q * P[o, 1, 1]) ** 2
+        if not active[o, j] and across > least:
             for i in range(C.shape[2]):
-                row_A[k, R, i] = p * G[k, 0, i] + q * G[k, 1, i]
-            row_b[k, R], row_source[k, R] = unit_b[j] - p * f[k, 0] - q * f[k, 1], j
+                row_A[k, R, i] = p * G[o, 0, i] + q * G[o, 1, i]
+            row_b[k, R], row_source[k, R] = unit_b[j] - p * f[o, 0] - q * f[o, 1], j
             R += 1
     for n in range(count):
         v, w = normals[n, 0], normals[n, 1]
-        p, q = v * P[k, 0, 0] + w * P[k, 1, 0], v * P[k, 0, 1] + w * P[k, 1, 1]
+        p, q = v * P[o, 0, 0] + w * P[o, 1, 0], v * P[o, 0, 1] + w * P[o, 1, 1]
         if p * p + q * q > least:
             for i in range(C.shape[2]):
                 row_A[k, R, i] = p * C[k, 0, i] + q * C[k, 1, i]
-            row_b[k, R] = v * offset[k, 0] + w * offset[k, 1] - p * d[k, 0] - q * d[k, 1]
+            row_b[k, R] = v * offset[o, 0] + w * offset[o, 1] - p * d[k, 0] - q * d[k, 1]
             row_source[k, R] = m + generator[n]
             R += 1
+    return R
 
 
 @item
@@ -254,28 +198,29 @@ def inverse_optimal(k, m, u, ball, C, d, normals, generator, count, none, row_A,
 
 @item
 @no_type_check
-def read_one(k, rows, sample, angles, fan, around, relaxes, paper, active_tolerance, scratch, judged, kkt):
-    """Fill the places of robot k in `judged` and `kkt`, results of `evidence`, and its normals. Returns their number.
+def read_one(k, o, rows, sample, angles, fan, around, relaxes, paper, solves, active_tolerance, scratch, judged, kkt):
+    """Fill what `evidence` returns of robot k but for half-spaces, and find its normals. Returns their number.
 
-    It is -1 if the robot is not informative.
+    It is -1 if the robot is not informative. Slacks and KKT conditions are those at place o. They are solved only if
+    that is asked for (`solves`).
     """
     A, b, hard, relaxed = rows
     C, d, u, usable, bound = sample
     unit, unit_b, near, angle, order, normals, generator = scratch
     informative, alarmed, infeasible, slack, excess = judged
-    G, f, projector, free, offset, active, n_active, rank, case = kkt
+    active = kkt[5]
     known, broken, strained, blind = judge(
-        k, A, b, hard, relaxed, u, bound, angles, active_tolerance, unit, unit_b, slack, excess, active, near
+        k, o, A, b, hard, relaxed, u, bound, angles, active_tolerance, unit, unit_b, slack, excess, active, near
     )
     wish_known = is_finite(k, C, d)
     usable_here = usable[k] and known and wish_known
     alarmed[k], informative[k] = usable_here and broken, usable_here and not broken and not blind
-    K, rank[k] = solve_active(k, unit, unit_b, active, offset, projector)
-    n_active[k], case[k] = K, K if K < 2 else 2 if rank[k] < 2 else 3 if K == 2 else 4
-    solve_motion(k, C, d, wish_known, rank[k], offset, projector, free, G, f)
+    infeasible[k] = False
+    if solves:
+        solve_one(k, o, C, d, wish_known, unit, unit_b, kkt)
     if not (informative[k] or (relaxes and usable_here and not broken)):
         return -1
-    found = find_generators(k, unit, active[k] if paper else near, fan, angle, order)
+    found = find_generators(k, unit, active[o] if paper else near, fan, angle, order)
     count, opening = outward_normals(angle, order, found, len(order), around, normals, generator)
     if relaxes:
         pointed = opening > 0 and not blind
@@ -324,9 +269,9 @@ def evidence(A, b, hard, relaxed, C, d, u, usable, bound, angles, ball, drift, c
     around, work = CRITICAL_DIRECTIONS if paper else DIRECTIONS, workspace(clip[3].shape[1])
     R = rows_for(m, paper, len(clip[0]) > 0)
     half_spaces = np.zeros((B, R, C.shape[2])), np.ones((B, R)), np.full((B, R), -1)
-    judged = np.empty(B, np.bool_), np.empty(B, np.bool_), np.zeros(B, np.bool_), np.empty((B, m)), np.empty((B, m))
+    judged = np.empty(B, np.bool_), np.empty(B, np.bool_), np.empty(B, np.bool_), np.empty((B, m)), np.empty((B, m))
     kkt = (
-        np.zeros((B, 2, C.shape[2])), np.zeros((B, 2)), np.zeros((B, 2, 2)), np.zeros((B, 2, 2)), np.zeros((B, 2)),
+        np.empty((B, 2, C.shape[2])), np.empty((B, 2)), np.empty((B, 2, 2)), np.empty((B, 2, 2)), np.empty((B, 2)),
         np.empty((B, m), np.bool_), np.empty(B, np.int64), np.empty(B, np.int64), np.empty(B, np.int64),
     )  # fmt: skip
     scratch = (
@@ -335,12 +280,14 @@ def evidence(A, b, hard, relaxed, C, d, u, usable, bound, angles, ball, drift, c
     )  # fmt: skip
     rows, sample, relaxes = (A, b, hard, relaxed), (C, d, u, usable, bound), relaxed.any()
     for k in range(B):
-        count = read_one(k, rows, sample, angles, fan, around, relaxes, paper, active_tolerance, scratch, judged, kkt)
+        count = read_one(
+            k, k, rows, sample, angles, fan, around, relaxes, paper, True, active_tolerance, scratch, judged, kkt
+        )
         if count < 0:
             continue
         of = *scratch[5:], count
         if paper:
-            critical_region(k, *scratch[:2], C, d, *kkt[:3], *kkt[4:6], *of, *half_spaces)
+            critical_region(k, k, *scratch[:2], C, d, *kkt[:3], *kkt[4:6], *of, *half_spaces)
         else:
             room, shift = ball[min(k, len(ball) - 1)], drift[min(k, len(drift) - 1)]
             if len(clip[0]) > 0:

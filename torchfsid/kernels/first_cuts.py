@@ -21,11 +21,12 @@ def first_cuts(vertices, count, reach, A, b, start):
     S, B, R = b.shape
     found = np.full(B, S)
     for k in range(B):
-        n = count[k]
+        n, reach_x, reach_y = count[k], reach[k, 0], reach[k, 1]
         box = box_of(vertices, k, n)
         for s in range(start[k], S):
             for r in range(R):
-                if exceeded(vertices, k, n, reach, box, A[s, k, r, 0], A[s, k, r, 1], b[s, k, r])[0] > 0:
+                p, q, c = A[s, k, r, 0], A[s, k, r, 1], b[s, k, r]
+                if exceeded(vertices, k, n, reach_x, reach_y, box, p, q, c)[0] > 0:
                     found[k] = s
                     break
             if found[k] < S:

@@ -289,7 +289,10 @@ def unclipped(k, C, d, u, r, margin, clip, normals, count, is_bounded, work):
 def clipped_inverse_optimal(
     k, m, u, ball, drift, C, d, clip, normals, generator, count, none, work, row_A, row_b, row_source
 ):
-    """The rows of `identification.inverse_optimal_set` for a clipped nominal control that are not padding."""
+    """The rows of `identification.inverse_optimal_set` for a clipped nominal control that are not padding.
+
+    Returns their number.
+    """
     found_A, found_b, found_of = work[-1]
     is_bounded = count > 0 and generator[0] == none
     found = unclipped(k, C, d, u, ball, drift, clip, normals, count, is_bounded, work)
@@ -300,3 +303,4 @@ def clipped_inverse_optimal(
         room = drift if p != 0 or q != 0 else 0.0
         row_b[k, n] = found_b[n] + room - p * d[k, 0] - q * d[k, 1]
         row_source[k, n] = 2 * m if of < 0 or generator[of] == none else m + generator[of] % m
+    return found

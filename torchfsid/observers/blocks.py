@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchfsid.device import any_of
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, array
 from torchfsid.identification.evidence import ObservationModel
@@ -52,14 +53,14 @@ def depends_on_theta(model: ObservationModel, measurement: Measurement, robots: 
 
 
 def times_of(samples: Measurement, robots: int) -> Float[Tensor, "S"]:
-    """The times of S samples of these robots, concatenated in the order of time [s].
+    """The times of S samples of these robots, concatenated in the order of time [s], on the CPU.
 
     Raises:
         InputError: the measurement is not such samples, or a sample has several times.
     """
     items = len(samples.x)
     if samples.x.ndim == 2 and items == robots:
-        return torch.tensor([samples.time], dtype=torch.float64, device=samples.x.device)
+        return torch.tensor([samples.time], dtype=torch.float64, device="cpu")
     if samples.x.ndim != 2 or robots == 0 or items == 0 or items % robots != 0:
         raise InputError("measurement", f"samples of {robots} robots, concatenated", tuple(samples.x.shape))
     times = (
@@ -69,7 +70,7 @@ def times_of(samples: Measurement, robots: int) -> Float[Tensor, "S"]:
     )
     if not bool((times == times[:, :1]).all()):
         raise InputError("measurement.t", "one time for all robots of a sample", "different times")
-    return times[:, 0]
+    return times[:, 0].cpu()
 
 
 def one_by_one(samples: Measurement, robots: int) -> Iterator[Measurement]:
@@ -88,20 +89,24 @@ class Course:
     Attributes:
         levels: the sets so far, see `outliers`. The last one is Theta.
         omega: the half-spaces of the samples (S*B, R), sample by sample.
-        t: the times of the samples [s].
+        t: the times of the samples [s], on the CPU.
+        alarmed: which samples are alarming (S*B).
         parts: sets Theta, each a batch (k,): those before the samples, and those that followed.
         which: for each sample and robot, the place of Theta after the sample in all `parts` one after the other.
         explained: whether a parameter of Theta explains the sample.
         proofs: for each (sample, robot) that emptied the last level, what `proof` says of the empty set.
+        any_alarm: whether a sample is alarming.
     """
 
     levels: Levels
     omega: Halfspaces
     t: Float[Tensor, "S"]
+    alarmed: Bool[Tensor, "N"]
     parts: list[FeasibleSet] = field(init=False)
     which: Int[Tensor, "S B"] = field(init=False)
     explained: Bool[Tensor, "S B"] = field(init=False)
     proofs: dict[tuple[int, int], tuple] = field(init=False, default_factory=dict)
+    any_alarm: bool = field(init=False)
 
     def run(self, prior: FeasibleSet | None, proof: Callable[[FeasibleSet, int], tuple]) -> None:
         """Cut the sets by all samples.
@@ -114,16 +119,17 @@ class Course:
         device = self.levels[-1].outcome.device
         every = torch.arange(robots, device=device)
         if samples == 1:  # no search: all robots are cut at once
-            explains, theta = self._cut(self.omega, float(self.t), None, prior, proof)
+            explains, theta = self._cut(self.omega, self.t.item(), None, prior, proof)
             self.parts, self.which, self.explained = [theta], every.unsqueeze(0), explains.unsqueeze(0)
             return
-        self.omega, now = self.omega.shortened(), torch.zeros_like(every)
+        self.any_alarm = bool(self.alarmed.any())
+        self.omega, now, times = self.omega.shortened(), torch.zeros_like(every), self.t.to(device)
         self.parts, known = [self.levels[-1]], robots
         which, explained = np.tile(np.arange(robots), (samples, 1)), np.ones((samples, robots), dtype=np.bool_)
         while bool((cut := (now := self._next_cuts(now)) < samples).any()):
             items = now.clamp(max=samples - 1) * robots + every
             omega = self.omega.select(items).where(cut.unsqueeze(-1))
-            explains, theta = self._cut(omega, self.t[items // robots], now, prior, proof)
+            explains, theta = self._cut(omega, times[items // robots], now, prior, proof)
             changed = cut.nonzero().flatten()
             self.parts.append(theta.select(changed))
             for robot, sample in zip(changed.tolist(), now[changed].tolist(), strict=True):
@@ -136,6 +142,9 @@ class Course:
     ) -> tuple[Bool[Tensor, "B"], FeasibleSet]:
         """Cut the sets by the samples `now` of the robots (None: the first). Returns `explained` of them, and Theta."""
         (*below, theta), explained = narrowed(self.levels, omega, t)
+        if now is None:  # all that the host has to know of an update, at once
+            any_empty, self.any_alarm = any_of(theta.is_empty, self.alarmed)
+            theta = theta.knowing(any_empty)
         if theta.any_empty:
             for robot in theta.is_empty.nonzero().flatten().tolist():
                 self.proofs[0 if now is None else int(now[robot]), robot] = proof(theta, robot)

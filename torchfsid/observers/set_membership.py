@@ -106,7 +106,7 @@ class SetEstimates:
     """The sets at S times, one after the other. `estimates[s]` is the `SetEstimate` of time s.
 
     Attributes:
-        t: times [s].
+        t: times [s], on the CPU.
         sets: all sets Theta of all robots that there were, batch (K,).
         which: for each time and robot, its place in `sets`.
         evidence: the evidence of the S*B samples, time by time.
@@ -127,7 +127,7 @@ class SetEstimates:
     def of(cls, estimate: SetEstimate) -> SetEstimates:
         """An estimate as those of one time."""
         return cls(
-            torch.tensor([estimate.t], dtype=torch.float64, device=estimate.status.device),
+            torch.tensor([estimate.t], dtype=torch.float64),
             estimate.feasible_set,
             torch.arange(len(estimate.status), device=estimate.status.device).unsqueeze(0),
             estimate.evidence,
@@ -255,10 +255,11 @@ class SetMembershipObserver:
         shape = len(times), robots
         read = partial(evidence, self.model) if self._windows is None else self._windows.read
         found = read(self.feasible_set, samples, self.compiled)
-        course = Course((*self._below, self.feasible_set), possible(found) if self.outliers else found.omega, times)
+        omega = possible(found) if self.outliers else found.omega
+        course = Course((*self._below, self.feasible_set), omega, times, found.alarmed)
         course.run(self.prior if reset else None, contradicting)
         status = self.status.expand(shape)
-        if course.proofs or bool(found.alarmed.any()):
+        if course.proofs or course.any_alarm:
             status = self._report(times, found, course)
         *below, self.feasible_set = course.levels
         self._below, self.status = tuple(below), status[-1]

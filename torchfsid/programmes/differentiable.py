@@ -23,6 +23,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchfsid.device import constant
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, lengths
 from torchfsid.kernels.active_rows import simplex_around
@@ -260,7 +261,7 @@ class _InscribedBall(torch.autograd.Function):
         """The rows (a, |a|), the points where the ball touches them, a mask of real rows, and their indices."""
         real, rows = rows < A.shape[-2], rows.clamp(max=A.shape[-2] - 1)
         N, index = _taken(A, rows)
-        sides = torch.from_numpy(simplex_around(A.shape[-1])[:, :-1]).to(A.device, non_blocking=True)
+        sides = constant(tuple(map(tuple, simplex_around(A.shape[-1])[:, :-1])), A.device)
         N = torch.where(real.unsqueeze(-1), N, sides)
         norms = lengths(N).unsqueeze(-1)
         touching = _finite(centre).unsqueeze(-2) + _finite(radius)[..., None, None] * N / norms

@@ -21,6 +21,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchfsid.device import all_seen
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, dot
 from torchfsid.robots.arguments import require_choice, require_numbers
@@ -106,10 +107,17 @@ class CollisionAvoidance:
         require_choice("neighbour_velocity", self.neighbour_velocity, get_args(NeighbourVelocity))
 
     def __call__(self, measurement: Measurement) -> Halfspaces:
-        seen = self.geometry(measurement)
         Ds = distance_kept(self.safety_distance, self.margin, measurement.radius, measurement.body_radii)
-        h = seen.squared - Ds**2 if self.distance == "squared" else seen.r - Ds
-        return Halfspaces(-seen.gradient, self.class_k(h) - seen.share).where(measurement.present)
+        if self.distance == "squared":  # the most frequent one needs no distances
+            away = away_from_bodies(measurement)
+            A, h = -2 * away, dot(away, away) - Ds**2
+        else:
+            seen = self.geometry(measurement)
+            A, h = -seen.gradient, seen.r - Ds
+        b = self.class_k(h)
+        if self.neighbour_velocity != "none":
+            b = b + dot(A, self._neighbours(measurement))
+        return Halfspaces(A, b).where(measurement.present)
 
     def geometry(self, measurement: Measurement) -> Geometry:
         """Distances, gradients of h and the neighbours' shares, which depend on neither gain nor safety distance."""
@@ -151,9 +159,9 @@ class CollisionAvoidance:
         2 sin(angle/2) |u - u_j|.
         """
         e = bounds.position.unsqueeze(-1) + bounds.body_position
-        clear, exact = seen.squared > e.square(), not bool(e.any())
+        clear = seen.squared > e.square()
         loose = torch.zeros_like(e) if self.neighbour_velocity == "none" else bounds.body_velocity
-        if exact and bool(clear.all()):
+        if all_seen(clear & (e == 0)):
             return Sight(seen.r, e, clear, e, loose)
         r = torch.where(clear, seen.squared, 1.0).sqrt()
         angle = torch.where(clear, (torch.where(clear, e, 0.0) / r).clamp(max=1.0).arcsin(), math.pi)
@@ -241,4 +249,4 @@ def distance_kept(
 def away_from_bodies(measurement: Measurement) -> Float[Tensor, "*batch m n"]:
     """x - x_j [m]. Slots without a body get a nonzero vector, so that norms and their gradients are finite."""
     present, away = measurement.present, measurement.x.unsqueeze(-2) - measurement.bodies
-    return away if bool(present.all()) else torch.where(present.unsqueeze(-1), away, 1.0)
+    return away if all_seen(present) else torch.where(present.unsqueeze(-1), away, 1.0)

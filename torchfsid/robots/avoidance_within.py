@@ -24,6 +24,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchfsid.device import all_seen
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, dot
 from torchfsid.robots.avoidance import Geometry, NeighbourVelocity, Sight
@@ -176,7 +177,7 @@ class AvoidanceWithin:
         pattern = self.unknown.pattern
         sight = pattern.sight(measurement, bounds, look.seen)
         nearest = farthest = look.at
-        if bool(sight.e.any()):
+        if not all_seen(sight.e == 0):
             pattern.require_monotone("positions have errors")
             nearest = self._at(measurement, (sight.r - sight.e).clamp(min=NEAREST))
             farthest = self._at(measurement, sight.r + sight.e)
@@ -199,7 +200,7 @@ class AvoidanceWithin:
         if measurement.radius is None or others is None:
             raise InputError("measurement.radius", "radii, since the barrier is given by a margin", None)
         radii = measurement.radius.unsqueeze(-1) + others
-        if unknown.distance == "euclidean" or bool((radii == unknown.reference).all()):
+        if unknown.distance == "euclidean" or all_seen(radii == unknown.reference):
             q = unknown.q(r, radii, 0.0)
             return q, q
         first, last = (unknown.q(r, radii, margin) for margin in self._margins)

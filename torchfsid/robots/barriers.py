@@ -9,12 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import ClassVar, Literal, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchfsid.device import all_seen, constant
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.robots.arguments import require_numbers
@@ -118,11 +120,11 @@ def controller_failed(
     controls are exactly zero.
     """
     assert measurement.u is not None
-    error = torch.as_tensor(control_error, dtype=rows.b.dtype, device=rows.b.device)
+    error = control_error if isinstance(control_error, Tensor) else rows.b.new_full((), control_error)
     slow = measurement.u.norm(dim=-1) <= error
-    if not bool(slow.any()):
+    if all_seen(~slow):
         return slow
-    stopped, sizes = (measurement.u == 0).all(-1), rows.norms()
+    stopped, sizes = (measurement.u == 0).all(-1), reduce(torch.hypot, rows.A.detach().abs().unbind(-1))
     least = torch.zeros_like(rows.b) if errors is None else errors.slack * sizes
     clearly = rows.b < -least - error.unsqueeze(-1) * sizes
     failed = stopped & (rows.b < least).any(-1) | slow & clearly.any(-1)
@@ -158,7 +160,7 @@ class SpeedBox(_OfNoBody):
     def __call__(self, measurement: Measurement) -> Halfspaces:
         x = measurement.x
         identity = torch.eye(len(self.limit), dtype=torch.float64, device=x.device)
-        limits = torch.tensor(self.limit * 2, dtype=torch.float64, device=x.device)
+        limits = constant(self.limit * 2, x.device)
         return _constant(torch.cat([identity, -identity]), limits, measurement)
 
     def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
@@ -227,7 +229,7 @@ class Arena(_OfNoBody):
         return [f"wall {sign}{axis}" for sign in "+-" for axis in "xyz"[: len(self.lower)]]
 
     def _distances(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch 2*n"]:
-        lower, upper = (torch.tensor(side, dtype=torch.float64, device=x.device) for side in (self.lower, self.upper))
+        lower, upper = (constant(tuple(side), x.device) for side in (self.lower, self.upper))
         to_upper, to_lower = upper - self.margin - x, x - lower - self.margin
         return torch.cat([to_upper, to_lower], dim=-1)
 

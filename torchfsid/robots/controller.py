@@ -22,6 +22,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchfsid.device import on_host
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.outcome import Status
@@ -117,12 +118,13 @@ class CbfQpController:
         """The controls for the parameters `theta` (*theta_batch, p). Its batch and the measurement's broadcast.
 
         Raises:
-            InputError: `theta` does not fit the task, or is not finite.
+            InputError: `theta` does not fit the task, or is not finite. On a device robots whose parameters are not
+                finite count as infeasible, since looking would wait for the device at every step.
         """
         C, d = self.task(measurement)
         if theta.shape[-1:] != C.shape[-1:]:
             raise InputError("theta", f"(*batch, {C.shape[-1]}): {self.task.parameter_names}", tuple(theta.shape))
-        if not bool(theta.isfinite().all()):
+        if on_host(theta) and not bool(theta.isfinite().all()):
             raise InputError("theta", "finite parameters", theta.detach())
         try:
             uhat = (C.to(torch.float64) @ theta.to(torch.float64).unsqueeze(-1)).squeeze(-1) + d

@@ -25,6 +25,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchfsid.device import constant
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, dot
 from torchfsid.robots.avoidance import CollisionAvoidance, NeighbourVelocity
@@ -107,7 +108,7 @@ class Ellipsoid:
     def _stretch(self, like: Float[Tensor, "*batch n"]) -> Float[Tensor, "n"]:
         if like.shape[-1] != len(self.semi_axes):
             raise InputError("measurement.x", f"positions with {len(self.semi_axes)} entries", tuple(like.shape))
-        return 1 / torch.tensor(self.semi_axes, dtype=torch.float64, device=like.device)
+        return 1 / constant(tuple(self.semi_axes), like.device)
 
     def _stretched(self, measurement: Measurement) -> Measurement:
         """The measurement in the other coordinates: vectors are multiplied by S, bounds by its norm."""

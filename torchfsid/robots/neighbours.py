@@ -30,6 +30,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchfsid.device import all_seen
 from torchfsid.errors import InputError
 from torchfsid.robots.barriers import Barrier
 from torchfsid.robots.bounds import NoiseBound
@@ -181,7 +182,7 @@ def left_out_inactive(
     # Twice the error, since the other bodies, to which a barrier may compare them, may be that much further.
     nearer = replace(measurement, left_out=left_out._replace(distance=left_out.distance - 2 * error))
     inactive = left_out.distance.isinf()  # no body is left out
-    if bool(inactive.all()):
+    if all_seen(inactive):
         return inactive
     proven = torch.ones_like(inactive)
     for barrier in barriers:

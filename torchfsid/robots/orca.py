@@ -35,6 +35,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchfsid.device import all_seen
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.robots.avoidance import NeighbourVelocity
@@ -140,7 +141,7 @@ class Orca:
             there = wrong._replace(e=wrong.e[open_at], eps=wrong.eps[open_at])
             wide = over_branches(some, own, ux[open_at], uy[open_at], there, *self._horizons)
             angle, slack = angle.index_put(open_at, wide.angle), slack.index_put(open_at, wide.slack)
-        if not bool((must_be == may_be).all()):
+        if not all_seen(must_be == may_be):
             violation = rows.low - rows.nx * ux - rows.ny * uy
             slack = torch.where(must_be, slack, torch.maximum(slack, violation))
         of_bodies = RowErrors(torch.where(may_be, angle, 0.0), torch.where(may_be, slack, 0.0))

@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchfsid.device import constant
 from torchfsid.errors import InputError
 from torchfsid.robots.arguments import require_names, require_numbers
 from torchfsid.robots.bounds import ErrorBounds
@@ -59,7 +60,7 @@ class Saturation:
             limit = self.limits[0]
             clipped = y if math.isinf(limit) else y * (limit / speed).clamp(max=1.0)
         else:
-            limits = y.new_tensor(self.limits)
+            limits = constant(tuple(self.limits), y.device)
             clipped = y.clamp(-limits, limits)
         return torch.where(speed < self.dead_speed, 0.0, clipped)
 
@@ -184,10 +185,8 @@ class GoalTask:
 
     def __call__(self, measurement: Measurement) -> Affine:
         gain = self.gain.unsqueeze(-1) if isinstance(self.gain, Tensor) and self.gain.ndim > 0 else self.gain
-        d = -gain * measurement.x
-        if self.damping > 0:
-            d = d - self.damping * _velocity(measurement)
-        return torch.diag_embed(gain * torch.ones_like(measurement.x)), d
+        brake = self.damping * _velocity(measurement) if self.damping > 0 else 0.0
+        return torch.diag_embed(gain * torch.ones_like(measurement.x)), -gain * measurement.x - brake
 
     def drift(self, bounds: ErrorBounds, largest: Tensor) -> Tensor:
         return (self.gain + self.gain_error) * bounds.position + self.damping * bounds.velocity
@@ -273,7 +272,7 @@ class OrbitTask:
     saturation: Saturation | None = None
 
     def __call__(self, measurement: Measurement) -> Affine:
-        turn = self.rate * measurement.x.new_tensor([[0.0, -1.0], [1.0, 0.0]])
+        turn = self.rate * constant(((0.0, -1.0), (1.0, 0.0)), measurement.x.device)
         return -turn.expand(*measurement.x.shape, 2), measurement.x @ turn.T
 
     def drift(self, bounds: ErrorBounds, largest: Tensor) -> Tensor:

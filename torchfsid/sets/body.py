@@ -32,6 +32,11 @@ class Contradiction:
         rows = nothing.unsqueeze(-1).repeat(1, 1, dim)
         return cls(rows, nothing, nothing.clone(), torch.full_like(nothing, PRIOR).long())
 
+    @property
+    def parts(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """A, b, time and source."""
+        return self.A, self.b, self.time, self.source
+
 
 @dataclass(frozen=True)
 class Clipped:

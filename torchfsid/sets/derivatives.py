@@ -87,27 +87,32 @@ class _Measure(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         volume, centroid = volume.clone(), centroid.clone()
         ctx.skeleton = skeleton
+        ctx.set_materialize_grads(False)
         ctx.save_for_backward(A, b, volume, centroid)
         return volume, centroid
 
     @staticmethod
-    def backward(ctx: Any, grad_volume: Tensor, grad_centroid: Tensor) -> tuple[Tensor, Tensor, None, None, None]:
+    def backward(ctx: Any, grad_volume: Tensor | None, grad_centroid: Tensor | None) -> tuple[Tensor | None, ...]:
+        if grad_volume is None and grad_centroid is None:
+            return (None,) * 5
         A, b, volume, centroid = ctx.saved_tensors
         skeleton, p = ctx.skeleton, A.shape[-1]
         # Second derivatives are wanted if gradients are enabled here.
         z = vertices(A, b, skeleton) if torch.is_grad_enabled() else skeleton.corners
         ends, normal = at(z, skeleton.simplices), at(A, skeleton.facet)
-        area = _over_length(ends, normal)
-        solid = skeleton.solid.unsqueeze(-1)
-        pull = torch.where(solid, grad_centroid / torch.where(skeleton.solid, volume, 1.0).unsqueeze(-1), 0.0)
-        push = grad_volume.unsqueeze(-1)
-
-        ends = ends - centroid[:, None, None]
-        along, total = dot(ends, pull[:, None, None]), added(ends, -2)
-        along_all = added(along, -1)
-        grad_right = area * (push + along_all / p)
-        moments = dot(ends.mT, along.unsqueeze(-2)) + total * along_all.unsqueeze(-1)
-        grad_row = -area.unsqueeze(-1) * (push.unsqueeze(-1) * total / p + moments / (p * (p + 1)))
+        area, ends = _over_length(ends, normal), ends - centroid[:, None, None]
+        total, grad_right, grad_row = added(ends, -2), torch.zeros_like(area), torch.zeros_like(normal)
+        if grad_volume is not None:
+            grad_right = area * grad_volume.unsqueeze(-1)
+            grad_row = -(grad_right / p).unsqueeze(-1) * total
+        if grad_centroid is not None:
+            solid = skeleton.solid.unsqueeze(-1)
+            pull = torch.where(solid, grad_centroid / torch.where(solid, volume.unsqueeze(-1), 1.0), 0.0)
+            along = dot(ends, pull[:, None, None])
+            along_all = added(along, -1)
+            grad_right = grad_right + area * along_all / p
+            moments = dot(ends.mT, along.unsqueeze(-2)) + total * along_all.unsqueeze(-1)
+            grad_row = grad_row - area.unsqueeze(-1) * moments / (p * (p + 1))
         grad_b = torch.zeros_like(b).scatter_add(1, skeleton.facet, grad_right)
         index = skeleton.facet.unsqueeze(-1).expand_as(grad_row)
         grad_A = torch.zeros_like(A).scatter_add(1, index, grad_row) - grad_b.unsqueeze(-1) * centroid.unsqueeze(1)

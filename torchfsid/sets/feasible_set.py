@@ -24,6 +24,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchfsid.device import has_kernels
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, array, as_halfspaces, finite
 from torchfsid.outcome import Status
@@ -131,7 +132,7 @@ class FeasibleSet:
     def dim(self) -> int:
         return self.body.A.shape[-1]
 
-    @property
+    @cached_property
     def is_empty(self) -> Bool[Tensor, "*batch"]:
         return self.outcome == Status.EMPTY
 
@@ -144,7 +145,8 @@ class FeasibleSet:
 
         New facets keep the `time` [s] and the `source` of their rows (default: 0, 1, ...). A row that only touches the
         set within round-off is moved outward by that round-off and then applied, so that the result is an outer set. If
-        merging facets would cost more than the cut has gained, the set stays as it was.
+        merging facets would cost more than the cut has gained, the set stays as it was. On a GPU with kernels nothing
+        waits for the check that rows are finite: those that are not do not cut.
 
         Raises:
             InputError: dimension or batch do not fit, or a row is NaN or infinite.
@@ -153,33 +155,32 @@ class FeasibleSet:
         if halfspaces.dim != p or not given.fits(halfspaces.batch_shape, self.batch_shape):
             expected = f"rows over R^{p} for a batch {tuple(self.batch_shape)}"
             raise InputError("halfspaces", expected, (tuple(halfspaces.A.shape), tuple(halfspaces.b.shape)))
-        if not finite(halfspaces.A, halfspaces.b):
+        waits = p != 2 or not has_kernels(halfspaces.A, halfspaces.b, self.outcome)
+        if waits and not finite(halfspaces.A, halfspaces.b):
             raise InputError("halfspaces", "finite rows", "NaN or infinity")
         if m == 0:
             return self
-        halfspaces = halfspaces.shortened()
+        halfspaces = halfspaces.shortened() if waits else halfspaces
         if self.any_empty:
             halfspaces = halfspaces.where(~self.is_empty.unsqueeze(-1))
         source = torch.arange(m, device=self.outcome.device) if halfspaces.source is None else halfspaces.source
-        stamp = torch.as_tensor(time, dtype=torch.float64, device=self.outcome.device).expand(*self.batch_shape, m)
-        rows = (
-            self._flat(halfspaces.A, (m, p)),
-            self._flat(halfspaces.b, (m,)),
-            self._flat(stamp, (m,)).contiguous(),
-            self._flat(source, (m,)),
-        )
-        clipped = self.body.clip(*rows, self.max_facets)
-        body, decided = clipped.body, not bool(clipped.outcome.any())
+        stamp = given.stamp(time, self.outcome)
+        rows = (halfspaces.A, (m, p)), (halfspaces.b, (m,)), (stamp.expand(*self.batch_shape, m), (m,)), (source, (m,))
+        clipped = self.body.clip(*(self._flat(part, shape) for part, shape in rows), self.max_facets)
+        body, decided = clipped.body, waits and not bool(clipped.outcome.any())
         if body is self.body and decided:
             return self
         shape, outcome, against = self.batch_shape, self.outcome, self.contradiction
         if not decided:
             outcome = torch.maximum(outcome, clipped.outcome.reshape(shape))
-            found = clipped.contradiction
-            fresh = Facets.of((found.A, found.b, found.time, found.source), shape)
-            against = against.where(self.is_empty, fresh)
+            against = against.where(self.is_empty, Facets.of(clipped.contradiction.parts, shape))
         last_cut = torch.where(clipped.shrunk.reshape(shape), stamp.amax(-1), self.last_cut)
         return replace(self, body=body, outcome=outcome, contradiction=against, last_cut=last_cut)
+
+    def knowing(self, any_empty: bool) -> FeasibleSet:
+        """This set. Whether any of it is EMPTY was found out with something else, so that nobody has to look again."""
+        vars(self)["any_empty"] = any_empty
+        return self
 
     def where(self, mask: Bool[Tensor, "*batch"], other: FeasibleSet) -> FeasibleSet:
         """This set where `mask`, `other` elsewhere."""

@@ -137,3 +137,10 @@ def definite(metric: Float[Tensor, "B p p"]) -> tuple[Float[Tensor, "B p p"], Bo
     _, fault = torch.linalg.cholesky_ex(torch.where(known[:, None, None], metric, identity).detach())
     known = known & (fault == 0)
     return torch.where(known[:, None, None], metric, identity), known
+
+
+def stamp(time: float | Tensor, like: Tensor) -> Float[Tensor, "*#batch m"]:
+    """The times of rows [s], in float64, on the device of another tensor. A number does not make the device wait."""
+    if isinstance(time, Tensor):
+        return torch.atleast_1d(time.to(like.device, torch.float64))
+    return torch.full((1,), time, dtype=torch.float64, device=like.device)

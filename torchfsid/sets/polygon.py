@@ -137,6 +137,7 @@ class Polygon:
         most: int,
     ) -> Clipped:
         """See `Body.clip`. An edge with parallel neighbours, as in a parallelogram, is never merged."""
+        time = once(time)
         differentiable = torch.is_grad_enabled() and (A.requires_grad or b.requires_grad)
         first = 1 + self.sheets.rows if differentiable else 0
         if b.shape[1] > 0 and device.has_kernels(A, b, self.b):
@@ -164,9 +165,10 @@ class Polygon:
         lost = (
             device.empty((B, 3, 2), b), device.empty((B, 3), b), device.empty((B, 3), b), device.empty((B, 3), b, ints),
         )  # fmt: skip
-        parts = *ring, *numbers, self.reach
-        rows = A, b, time, source
-        device.launch("planar.clip", (self.fields(), rows), (most, first > 0), (parts, found, lost))
+        late = torch.zeros(B + 1, dtype=torch.int32, device=b.device)
+        fields = tuple(map(device.side_by_side, self.fields()))
+        parts, rows = (*ring, *numbers, fields[-1]), (A, b, time, source)
+        device.launch("planar.clip", (fields, rows), (most, first > 0), (parts, found, lost, (late,)))
         body = Polygon(*parts, sheets=self.sheets)
         if first > 0:
             new = (body.label < 0).nonzero(as_tuple=True)
@@ -191,11 +193,14 @@ class Polygon:
         """The corners, each the solution of its two rows."""
         if not self._differentiable():
             return self.corners
-        return derivatives.vertices(*self.rows(), self._skeleton())
+        return derivatives.vertices(*self.rows(), self._skeleton(self._triangles().sum(-1)))
 
     def volume(self) -> Float[Tensor, "B"]:
         """The area by the shoelace formula about the first corner, which is accurate for thin polygons."""
-        return self._measure()[0] if self._differentiable() else self._triangles().sum(-1)
+        area = self._triangles().sum(-1)
+        if not self._differentiable():
+            return area
+        return derivatives.measure(*self.rows(), area, self.corners[:, 0], self._skeleton(area))[0]
 
     def centroid(self) -> Float[Tensor, "B 2"]:
         """The centre of area. If the area is lost in round-off, it is the middle of the bounding box."""
@@ -268,7 +273,7 @@ class Polygon:
         middle = (self.corners.amin(1) + self.corners.amax(1)) / 2
         centroid = torch.where(solid.unsqueeze(-1), centroid, middle)
         if self._differentiable():
-            return derivatives.measure(*self.rows(), area, centroid, self._skeleton())
+            return derivatives.measure(*self.rows(), area, centroid, self._skeleton(area))
         return area, centroid
 
     def _solid(self, area: Float[Tensor, "B"]) -> Bool[Tensor, "B"]:
@@ -276,14 +281,14 @@ class Polygon:
         size = (self.corners.amax(1) - self.corners.amin(1)).amax(-1)
         return area > ROUND_OFF * size * torch.maximum(size, self.corners.abs().amax((1, 2)))
 
-    def _skeleton(self) -> Skeleton:
+    def _skeleton(self, area: Float[Tensor, "B"]) -> Skeleton:
         slot, count = torch.arange(self.slots, device=self.count.device), self.count.unsqueeze(-1)
         here = torch.where(slot < count, slot, 0)
         bases = torch.stack([(here - 1) % count, here], dim=-1)
         rows = at(self.A, bases)
         ends = torch.stack([here, torch.where(slot < count, (slot + 1) % count, 0)], dim=-1)
         solved, facet = independent(rows[:, :, 0], rows[:, :, 1]), slot.expand(self.b.shape)
-        return Skeleton(self.corners, bases, solved, ends, facet, self._solid(self._triangles().sum(-1)))
+        return Skeleton(self.corners, bases, solved, ends, facet, self._solid(area))
 
     def _disc_by_programme(self) -> tuple[Float[Tensor, "B 2"], Float[Tensor, "B"]]:
         """The inscribed disc by `programmes.inscribed_ball`, which works in any dimension."""
@@ -302,6 +307,13 @@ def independent(v: Float[Tensor, "*B 2"], w: Float[Tensor, "*B 2"]) -> Bool[Tens
     return cross(v, w).abs() > PARALLEL_EDGES * torch.linalg.vector_norm(v, dim=-1) * torch.linalg.vector_norm(
         w, dim=-1
     )
+
+
+def once(tensor: Tensor) -> Tensor:
+    """The tensor with one entry along each dimension along which it was expanded."""
+    for dim, stride in enumerate(tensor.stride()):
+        tensor = tensor.narrow(dim, 0, 1) if stride == 0 and tensor.shape[dim] > 1 else tensor
+    return tensor
 
 
 def cross(v: Tensor, w: Tensor) -> Tensor:

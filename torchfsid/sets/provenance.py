@@ -8,14 +8,15 @@ proportional to the number of facets.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchfsid.halfspaces import array
+from torchfsid.halfspaces import Halfspaces, array
 
 
 @dataclass(frozen=True)
@@ -77,8 +78,45 @@ class Sheets:
         """The facets' rows A and b, with the gradients of the rows that their labels refer to."""
         if not self.sheets:
             return A, b
-        of_A = torch.cat([A.new_zeros(1, A.shape[-1]), *(rows for rows, _ in self.sheets)])
-        of_b = torch.cat([b.new_zeros(1), *(right for _, right in self.sheets)])
-        of_A, of_b = (part.index_select(0, label.flatten()).unflatten(0, label.shape) for part in (of_A, of_b))
-        # Zeros with gradients are added. So a facet that was moved outward keeps its moved b.
-        return A + (of_A - of_A.detach()), b + (of_b - of_b.detach())
+        # A facet that was moved outward keeps its moved b.
+        return _Attached.apply(A, b, label, *(part for sheet in self.sheets for part in sheet))  # type: ignore[return-value]
+
+
+class _Attached(torch.autograd.Function):
+    """(A, b, label, A and b of each sheet) -> A and b, as if each facet were the row of its label."""
+
+    @staticmethod
+    def forward(ctx: Any, A: Tensor, b: Tensor, label: Tensor, *sheets: Tensor) -> tuple[Tensor, Tensor]:
+        ctx.save_for_backward(label)
+        ctx.lengths = [len(b) for b in sheets[1::2]]
+        return A.clone(), b.clone()
+
+    @staticmethod
+    def backward(ctx: Any, grad_A: Tensor, grad_b: Tensor) -> tuple[Tensor | None, ...]:
+        label, rows = ctx.saved_tensors[0].flatten(), 1 + sum(ctx.lengths)
+        parts = (
+            part.new_zeros(rows, *part.shape[2:]).index_add(0, label, part.flatten(0, 1)).split([1, *ctx.lengths])[1:]
+            for part in (grad_A, grad_b)
+        )
+        return None, None, None, *(grad for pair in zip(*parts, strict=True) for grad in pair)
+
+
+def carried(sets: Any, facets: tuple[Int[Tensor, "N"], Int[Tensor, "N"]], rows: Halfspaces) -> Any:
+    """A batch (B,) of sets without gradients, some of whose facets carry the gradients of the rows they came from.
+
+    So rows that were found without gradients are computed again with gradients only where they have become facets.
+
+    Args:
+        sets: the sets.
+        facets: these facets, as item and slot.
+        rows: batch (N,): for each of them several rows, one of which is its own in numbers.
+    """
+    body = sets.body
+    with torch.no_grad():
+        apart = (rows.A - body.A[facets].unsqueeze(1)).square().sum(-1) + (
+            rows.b - body.b[facets].unsqueeze(1)
+        ).square()
+        own = torch.arange(len(apart), device=apart.device), apart.argmin(-1)
+    label = torch.zeros_like(body.label)
+    label[facets] = own[0] + 1
+    return replace(sets, body=replace(body, label=label, sheets=Sheets().with_sheet(rows.A[own], rows.b[own])))
