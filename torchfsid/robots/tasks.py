@@ -57,8 +57,7 @@ class Saturation:
     def __call__(self, y: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
         speed = y.square().sum(-1, keepdim=True).clamp(min=1e-300).sqrt()
         if self.shape == "norm":
-            limit = self.limits[0]
-            clipped = y if math.isinf(limit) else y * (limit / speed).clamp(max=1.0)
+            clipped = y if math.isinf(self.limits[0]) else y * (self.limits[0] / speed).clamp(max=1.0)
         else:
             limits = constant(tuple(self.limits), y.device)
             clipped = y.clamp(-limits, limits)
