@@ -171,11 +171,11 @@ def test_windows_in_blocks(task: GoalTask) -> None:
 def test_what_depends_on_the_sets() -> None:
     exact, uncertain = NoiseBound(ERROR), NoiseBound(ERROR, position=RHO)
     sample = team(3)[5].observed_only()
-    assert not depends_on_theta(made(noise=uncertain).model, sample)
-    assert not depends_on_theta(made(3, UnknownGainGoalTask(), noise=exact).model, sample)
-    assert depends_on_theta(made(3, UnknownGainGoalTask(), noise=uncertain).model, sample)
-    assert depends_on_theta(made(task=CLIPPED).model, sample)
-    assert depends_on_theta(made(task=GoalTask(1.0, gain_error=0.1)).model, sample)
+    assert not depends_on_theta(made(noise=uncertain).model, sample, 4)
+    assert not depends_on_theta(made(3, UnknownGainGoalTask(), noise=exact).model, sample, 4)
+    assert depends_on_theta(made(3, UnknownGainGoalTask(), noise=uncertain).model, sample, 4)
+    assert depends_on_theta(made(task=CLIPPED).model, sample, 4)
+    assert depends_on_theta(made(task=GoalTask(1.0, gain_error=0.1)).model, sample, 4)
 
 
 def test_the_hybrid_in_blocks() -> None:

@@ -278,7 +278,7 @@ def sample_of(model: ObservationModel, theta: FeasibleSet, measurement: Measurem
     if measurement.observed is not None:
         usable = usable & measurement.observed
     if measurement.left_out is not None:
-        error = u.new_full((), 2 * noise.position)
+        error = u.new_zeros(()) + 2 * noise.position
         if measurement.position_error is not None:
             error = error + measurement.position_error
         usable = usable & left_out_inactive(model.barriers, within_bounds(measurement, noise), largest, error)
