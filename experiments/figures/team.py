@@ -12,8 +12,7 @@ from matplotlib.patches import Patch
 from experiments.figures import drawing
 from experiments.figures.style import SET_NAMES, team_colours
 from experiments.runs.config import SceneConfig
-from experiments.runs.lengths import ROOT_NAMES, lengths
-from experiments.runs.saved import Results
+from experiments.runs.saved import ROOT_NAMES, Results
 
 PANELS = (
     ("critical_region", "paper's region"),
@@ -65,7 +64,7 @@ def _draw_snapshot(axes: Axes, results: Results, config: SceneConfig, k: int) ->
 
 def draw_comparison(results: Results, config: SceneConfig) -> Figure:
     """Lengths over time, one colour per robot: each kind of set, the filter, the hybrid."""
-    measures, colours, root = lengths(results), team_colours(config), ROOT_NAMES[config.dimension]
+    measures, colours, root = results.lengths, team_colours(config), ROOT_NAMES[config.dimension]
     panels = [panel for panel in PANELS if panel[0] in (*config.sets, *measures)]
     figure = Figure(figsize=(2.75 * len(panels), 3.5), layout="constrained")
     all_axes = figure.subplots(1, len(panels), sharex=True, sharey=True)
