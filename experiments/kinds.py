@@ -86,7 +86,7 @@ KINDS = {
         "sweep",
         SweepConfig,
         Later("sweeps.sweep", "run_sweep"),
-        Later("sweeps.summary", "print_sweep"),
+        Later("sweeps.swept", "print_sweep"),
         Later("figures.sweep", "draw_sweep"),
         Later("pages", "sweep_page"),
     ),

@@ -24,9 +24,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from experiments.figures.safety_parameters import draw_study
 from experiments.results import write_rows
-from experiments.studies.safety_summary import TARGET, as_markdown, tables
+from experiments.studies.safety_summary import TARGET, as_markdown, draw_study, tables
 from experiments.studies.safety_teams import Form, Prior, Setting, Team, draw, logged
 from experiments.sweeps.journal import Journal
 from experiments.sweeps.workers import workers

@@ -19,8 +19,7 @@ from experiments.runs.config import SceneConfig
 from experiments.sweeps.config import SweepConfig
 from experiments.sweeps.journal import Journal
 from experiments.sweeps.record import most_alike, observed
-from experiments.sweeps.summary import summarise_sweep
-from experiments.sweeps.tables import write_tables
+from experiments.sweeps.swept import summarise_sweep, write_tables
 from experiments.sweeps.workers import Workers, workers
 from torchfsid.errors import FsidError, one_line
 
