@@ -14,7 +14,7 @@ derivative. So the integral of these derivatives differs from the change of log 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -111,33 +111,20 @@ def _fit_for_it(search: Search, settings: GradientCheckConfig, horizon: int) -> 
     return torch.cat(fit)[: settings.placements]
 
 
-class _Gradients(NamedTuple):
-    """Gradients of the mean over goals.
-
-    Attributes:
-        whole: by automatic differentiation.
-        smooth_part: by automatic differentiation, without the score term.
-        differences: by central differences.
-    """
-
-    whole: Tensor
-    smooth_part: Tensor
-    differences: Tensor
-
-
 def _check(probing: Probing, placements: Tensor, goals: Tensor, horizon: int, step: float) -> list[dict[str, Any]]:
     of_each = [_gradients(probing, placement.unsqueeze(0), goals, horizon, step) for placement in placements]
     rows = []
     for objective in OBJECTIVES:
-        together = _Gradients(*map(torch.cat, zip(*(of[objective] for of in of_each), strict=True)))
+        together = map(torch.cat, zip(*(of[objective] for of in of_each), strict=True))
         about = {"way_points": placements.shape[1], "objective": objective, "placements": len(placements)}
-        rows.append(about | _compare(together) | {"horizon": horizon})
+        rows.append(about | _compare(*together) | {"horizon": horizon})
     return rows
 
 
 def _gradients(
     probing: Probing, placement: Tensor, goals: Tensor, horizon: int, step: float
-) -> dict[Objective, _Gradients]:
+) -> dict[Objective, tuple[Tensor, Tensor, Tensor]]:
+    """Gradients of the mean: by automatic differentiation, the same without the score term, and by differences."""
     leaf = placement.clone().requires_grad_()
     area = probing.left(leaf, goals, horizon).area
     differences: dict[Objective, Tensor] = {objective: torch.zeros_like(placement) for objective in OBJECTIVES}
@@ -151,19 +138,19 @@ def _gradients(
         phi = area if objective == "area" else area.log()
         (whole,) = torch.autograd.grad(expectation(area, objective).sum(), leaf, retain_graph=True)
         (smooth_part,) = torch.autograd.grad(phi.mean(), leaf, retain_graph=True)
-        found[objective] = _Gradients(whole, smooth_part, of)
+        found[objective] = whole, smooth_part, of
     return found
 
 
-def _compare(of: _Gradients) -> dict[str, float]:
-    each = torch.cosine_similarity(of.whole.flatten(1), of.differences.flatten(1))
+def _compare(whole: Tensor, smooth_part: Tensor, differences: Tensor) -> dict[str, float]:
+    each = torch.cosine_similarity(whole.flatten(1), differences.flatten(1))
     return {
-        "cosine": _cosine(of.whole, of.differences),
+        "cosine": _cosine(whole, differences),
         "median_cosine": float(each.median()),
         "least_cosine": float(each.min()),
-        "length_ratio": float(of.whole.norm() / of.differences.norm()),
-        "cosine_without": _cosine(of.smooth_part, of.differences),
-        "length_ratio_without": float(of.smooth_part.norm() / of.differences.norm()),
+        "length_ratio": float(whole.norm() / differences.norm()),
+        "cosine_without": _cosine(smooth_part, differences),
+        "length_ratio_without": float(smooth_part.norm() / differences.norm()),
     }
 
 
