@@ -10,7 +10,7 @@ import csv
 import io
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn, Self
@@ -238,6 +238,40 @@ class Appender:
         except BaseException:
             self.file.truncate(whole)
             raise
+
+
+class Journal(Appender):
+    """A journal: one line of JSON per finished run, appended and synced in the order of finishing.
+
+    A process that is killed may leave a last line without its end. It is cut off when the journal is opened again. Any
+    other line that is not JSON (a damaged disk) is ignored. In both cases the run is run again. Whole lines are never
+    changed.
+
+    Attributes:
+        records: the records of whole lines, by number of the run.
+    """
+
+    def __init__(self, path: Path):
+        super().__init__(path, keep=True)
+        self.file.seek(0)
+        *lines, rest = self.file.read().split(b"\n")
+        self.file.truncate(self.file.tell() - len(rest))
+        records = filter(None, map(_parse, lines))
+        self.records: dict[int, dict[str, Any]] = {record["run"]: record for record in records}
+
+    def add(self, records: Sequence[dict[str, Any]]) -> None:
+        """Append records. After the return they survive a crash."""
+        self.append("".join(json.dumps(record, allow_nan=False) + "\n" for record in records))
+        os.fsync(self.file.fileno())
+        self.records |= {record["run"]: record for record in records}
+
+
+def _parse(line: bytes) -> dict[str, Any] | None:
+    try:
+        record = json.loads(line)
+    except ValueError:
+        return None
+    return record if isinstance(record, dict) and isinstance(record.get("run"), int) else None
 
 
 def rows_of(columns: Mapping[str, Iterable[Any]]) -> list[dict[str, Any]]:
