@@ -65,7 +65,7 @@ KINDS = {
         Later("runs.scene", "run_scene"),
         Later("runs.summary", "print_verdict"),
         Later("figures.scene", "draw_scene"),
-        Later("pages", "scene_page"),
+        Later("pages", "results_page"),
     ),
     "cases": Kind(
         "run",
@@ -73,7 +73,7 @@ KINDS = {
         Later("runs.cases", "run_cases"),
         Later("runs.cases", "print_cases"),
         Later("figures.cases", "draw_cases"),
-        Later("pages", "cases_page"),
+        Later("pages", "results_page"),
     ),
     "swarm": Kind(
         "run",
