@@ -241,6 +241,18 @@ def test_compiled_critical_regions_are_those_of_torch():
         torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
 
 
+def test_padding_is_not_active_whatever_is_said_of_it():
+    """Neither in compiled code, nor in torch's, whose derivatives are differentiated again."""
+    A, b = torch.tensor([[[-1.0, 1.0], [0.0, 0.0]]], dtype=torch.float64), torch.ones(1, 2, dtype=torch.float64)
+    C, d, grads = torch.eye(2, dtype=torch.float64)[None], torch.zeros(1, 2, dtype=torch.float64), []
+    for said, again in ((True, False), (True, True), (False, False)):
+        region = critical_region(Halfspaces(A, b), torch.tensor([[True, said]]), C.requires_grad_(), d)
+        grads += torch.autograd.grad(region.A.square().sum(), C, create_graph=again)
+    assert grads[2].abs().max() > 0
+    torch.testing.assert_close(grads[0], grads[2], rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(grads[1], grads[2], rtol=1e-12, atol=1e-12)
+
+
 def test_critical_region_at_orthogonal_equal_rows():
     A = torch.tensor([[1.0, 1.0], [1.0, -1.0], [0.3, 1.0]], dtype=torch.float64, requires_grad=True)
     b = torch.tensor([0.5, 0.5, 4.0], dtype=torch.float64, requires_grad=True)

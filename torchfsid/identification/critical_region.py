@@ -54,7 +54,7 @@ def critical_region(
 
 
 def _in_torch(A: Tensor, b: Tensor, active: Tensor, C: Tensor, d: Tensor) -> Halfspaces:
-    unit = Halfspaces(A, b).normalised()
+    unit, active = Halfspaces(A, b).normalised(), active & (A != 0).any(-1)  # zero rows are never active
     return region_of(unit, solve_unit(unit, active, C, d), C, d)
 
 
