@@ -1,8 +1,8 @@
 """python -m benchmarks cuda [--sizes 10000 100000 1000000] [--steps 12]
 
-A fleet's sets on a GPU (8 neighbours, noisy controls, see `scenario`), the exact layers (`cuda_layers`) and a gradient
-step of the probe design (`cuda_probe`). Each part prints its own lines and is saved when it is done. One that fails
-prints why, and the others go on. Truths lost must be 0.
+A fleet's sets on a GPU (8 neighbours, noisy controls, see `scenario`), the exact layers (`cuda_layers`), a gradient
+step of the probe design (`cuda_probe`) and robots in space (`cuda_space`). Each part prints its own lines and is saved
+when it is done. One that fails prints why, and the others go on. Truths lost must be 0.
 
 Read and clip: what a measurement says of each robot, and the cut of its set, from rows on the device that lie side by
 side (`device`). Update: the whole `SetMembershipObserver.update`, rows from positions included. Times are of one after
@@ -224,6 +224,7 @@ def main(arguments: list[str]) -> None:
         "fleet": partial(fleets, options.sizes, options.steps),
         "layers": lambda: import_module("benchmarks.cuda_layers").compare(),
         "probe": lambda: import_module("benchmarks.cuda_probe").compare(),
+        "space": lambda: import_module("benchmarks.cuda_space").compare(),
     }
     results, began = {}, time.perf_counter()
     for name, part in parts.items():

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, NoReturn, Self
 
 import numpy as np
 
-from torchfsid.commands.results_folder import named
+from torchfsid.commands.results_folder import named, whole
 from torchfsid.errors import FigureError, one_line
 
 
@@ -210,19 +210,6 @@ def read_json(path: Path) -> Any:
     """
     with reading(path):
         return json.loads(path.read_text(encoding="utf-8"))
-
-
-@contextmanager
-def whole(path: Path) -> Iterator[Path]:
-    """In this block write the yielded file. At its end the file becomes `path`. After an error `path` is as it was."""
-    partial = path.with_name(path.name + ".partial")
-    try:
-        with named(path):
-            yield partial
-            partial.replace(path)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
 
 
 class Appender:

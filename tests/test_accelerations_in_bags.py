@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.bag_logs import refusal, section
 from tests.bag_writer import acceleration, odometry, odometry_of, section_of, write_bag
 from tests.logs import write_log
-from tests.test_bags import refusal, section
 from tests.test_second_order_logs import CONFIG, a_run, are_inside, observed
 from torchfsid.commands.declared_log import DeclaredLog
 from torchfsid.config.documents import validate

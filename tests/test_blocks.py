@@ -171,11 +171,11 @@ def test_windows_in_blocks(task: GoalTask) -> None:
 def test_what_depends_on_the_sets() -> None:
     exact, uncertain = NoiseBound(ERROR), NoiseBound(ERROR, position=RHO)
     sample = team(3)[5].observed_only()
-    assert not depends_on_theta(made(noise=uncertain).model, sample)
-    assert not depends_on_theta(made(3, UnknownGainGoalTask(), noise=exact).model, sample)
-    assert depends_on_theta(made(3, UnknownGainGoalTask(), noise=uncertain).model, sample)
-    assert depends_on_theta(made(task=CLIPPED).model, sample)
-    assert depends_on_theta(made(task=GoalTask(1.0, gain_error=0.1)).model, sample)
+    assert not depends_on_theta(made(noise=uncertain).model, sample, 4)
+    assert not depends_on_theta(made(3, UnknownGainGoalTask(), noise=exact).model, sample, 4)
+    assert depends_on_theta(made(3, UnknownGainGoalTask(), noise=uncertain).model, sample, 4)
+    assert depends_on_theta(made(task=CLIPPED).model, sample, 4)
+    assert depends_on_theta(made(task=GoalTask(1.0, gain_error=0.1)).model, sample, 4)
 
 
 def test_the_hybrid_in_blocks() -> None:
@@ -239,7 +239,7 @@ def test_wrong_blocks_are_refused() -> None:
 def test_a_bound_for_each_robot() -> None:
     """In blocks, and in the parts of a fleet, each robot has its own."""
     bounds = torch.tensor([0.01, 0.2, 0.05, 0.01], dtype=torch.float64)
-    samples = team(3, broken=False)
+    samples = team(3, broken=False)[:24]
     for noise in (NoiseBound(bounds), NoiseBound(ERROR, bounds), NoiseBound(bounds, position=RHO)):
         one_by_one, in_blocks, alone = made(noise=noise), made(noise=noise), made(noise=noise)
         fleets = [FleetObserver(alone, threads=threads) for threads in (2, 4)]
@@ -247,9 +247,27 @@ def test_a_bound_for_each_robot() -> None:
             one_by_one.update(sample)
             for fleet in fleets:
                 fleet.update(sample)
-        assert sum(len(found) for block in blocks(samples, 20) for found in in_blocks.read(block)) == SAMPLES
+        assert sum(len(found) for block in blocks(samples, 10) for found in in_blocks.read(block)) == 24
         assert_same(in_blocks, one_by_one)
         for fleet in fleets:
             assert_same_sets(fleet.feasible_set, one_by_one.feasible_set)
     with pytest.raises(InputError, match="a bound for each of 4 robots"):
         made(noise=NoiseBound(bounds[:3])).update(samples[0])
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_gain_for_each_robot() -> None:
+    gains = torch.tensor([[1.2], [1.5704], [2.0], [3.0]], dtype=torch.float64)
+    own = CollisionAvoidance(ClassK(gains), safety_distance=0.3515)
+    samples, one_by_one, in_blocks = team(3, broken=False)[:20], made(barrier=own), made(barrier=own)
+    for sample in samples:
+        one_by_one.update(sample)
+    for block in blocks(samples, 7):
+        list(in_blocks.read(block))
+    assert_same(in_blocks, one_by_one)
+    for robot, gain in enumerate(gains.flatten().tolist()):
+        alone = replace(own, class_k=ClassK(gain))
+        torch.testing.assert_close(own(samples[5]).b[robot], alone(samples[5]).b[robot], rtol=0, atol=0)
+    for threads in (2, 4):
+        with pytest.raises(InputError, match=f"class_k.gain: .* each of {4 // threads} robots"):
+            FleetObserver(made(barrier=own), threads).update(samples[0])

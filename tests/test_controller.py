@@ -182,9 +182,9 @@ def test_what_the_controller_refuses():
         controller(scene(), tensor([1.0, 2.0, 3.0]))
     with pytest.raises(InputError, match="finite"):
         controller(scene(), tensor([1.0, float("nan")]))
-    with pytest.raises(InputError, match="one team"):
+    with pytest.raises(InputError, match="teams"):
         controller(scene(), torch.zeros(4, 1, 2, dtype=torch.float64))
-    with pytest.raises(InputError, match="one team"):
+    with pytest.raises(InputError, match="teams"):
         controller(scene(), torch.zeros(4, 2, dtype=torch.float64))
     with pytest.raises(InputError, match="slot i"):
         controller(Measurement.of_team(0.0, BODIES, robots=[1]), tensor([1.0, 2.0]))

@@ -83,7 +83,7 @@ def test_a_run_of_a_sweep(shape: str) -> None:
     noise = f"measurement_noise={{velocity: 0.01, shape: {shape}}}"
     config = load(CONFIGS / "orca_circle.yaml", ["dt=0.2", "duration=0.8", "snapshots=[0.2]", noise])
     assert isinstance(config, SceneConfig)
-    row = observed(config, (0.0, 0.4))["row"]
+    row = observed([config], (0.0, 0.4))[0]["row"]
     assert row["inverse_optimal_lost"] == row["inverse_optimal_alarm"] == row["inverse_optimal_inconsistent"] == 0
     assert "critical_region_lost" not in row
 

@@ -12,6 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchmarks.cuda_probe import compare, corridor
 from experiments.__main__ import main
 from experiments.design.config import ProbePlacementConfig
 from experiments.design.placement import place
@@ -195,6 +196,16 @@ def test_gradients_of_runs_are_those_of_the_closed_loop(avoidance: str):
     (theirs,) = torch.autograd.grad((by_steps * weights).sum(), placements)
     torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
     assert (theirs[:2].flatten(1).norm(dim=-1) > 0.1).all()
+
+
+def test_the_benchmark_takes_the_scene_of_the_file(capsys: pytest.CaptureFixture[str]):
+    """Its gradient step runs where it is told to, and both sides agree."""
+    scene, of_file = corridor(), Probing.of(load())
+    for name, part in vars(scene).items():
+        assert torch.equal(part, getattr(of_file, name)) if isinstance(part, Tensor) else part == getattr(of_file, name)
+    (row,) = compare("cpu", [32]).values()
+    assert row["value_difference"] == row["gradient_difference"] == 0
+    assert "32 x 32 items" in capsys.readouterr().out
 
 
 # What counts --------------------------------------------------------------------------------------------------------

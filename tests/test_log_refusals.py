@@ -136,3 +136,23 @@ def test_one_wrong_cell_in_a_right_log(row, column, cell, tmp_path_factory):
     path = tmp_path_factory.getbasetemp() / "cell.csv"
     path.write_text("\n".join(",".join(row) for row in rows), encoding="utf-8")
     reads_or_refuses(path)
+
+
+UNITS = {"t in milliseconds": (1e3, 1), "positions in millimetres": (1, 1e3)}
+
+
+@pytest.mark.parametrize("told", [*UNITS, None])
+def test_times_in_milliseconds(write, told: str | None) -> None:
+    """A robot on a circle, and one that stands, with errors of positions and velocities."""
+    of_time, of_position = UNITS.get(told or "", (1, 1))
+    rng, lines = np.random.default_rng(3), []
+    for k in range(40):
+        t, (dx, dy), (du, dv) = 0.02 * k, rng.normal(0, 1e-4, 2), rng.normal(0, 0.01, 2)
+        x, y = of_position * np.array([np.cos(t) + dx, np.sin(t) + dy])
+        lines.append(f"{of_time * t},a,{x},{y},{-np.sin(t) + du},{np.cos(t) + dv}")
+        lines.append(f"{of_time * t},b,{of_position * dx},{of_position * dy},{du},{dv}")
+    path = write(HEADER + "\n".join(lines) + "\n")
+    if told is None:
+        assert len(read_csv(path).t) == 40
+    else:
+        assert refusal(path).endswith(f"times the ways between positions: {told}?")

@@ -67,7 +67,7 @@ def observed(log: Path, out: Path, config: dict) -> list[dict[str, str]]:
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("on_inconsistent", ["hold", "reset"])
 def test_whatever_the_blocks_and_the_engine(
-    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, on_inconsistent: str
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undrawn: None, on_inconsistent: str
 ) -> None:
     config = CONFIG | {"on_inconsistent": on_inconsistent}
     found = {}

@@ -13,7 +13,7 @@ import torch
 
 from experiments.kinds import load
 from experiments.runs.config import SceneConfig
-from experiments.runs.recording import SimulatedScene, simulate_scene
+from experiments.runs.recording import simulate_scene
 from experiments.sweeps.config import SweepConfig
 from experiments.teams import TeamConfig
 from torchfsid.identification.evidence import ObservationModel, evidence
@@ -42,9 +42,9 @@ def scene(shape: str, **noise: float) -> SceneConfig:
 
 @pytest.mark.parametrize("shape", ["uniform", "bias", "adversarial"])
 def test_errors_keep_their_bounds_and_spare_obstacles(shape: str):
-    measured = simulate_scene(scene(shape))
-    assert len(measured.config.obstacles) > 0
-    robots = len(measured.config.robots)
+    config = scene(shape)
+    measured, robots = simulate_scene(config), len(config.robots)
+    assert len(config.obstacles) > 0
     for seen, true, bound in (
         (measured.measured.x, measured.true.x, 0.01),
         (measured.measured.u, measured.true.u, 0.02),
@@ -62,16 +62,16 @@ def test_errors_keep_their_bounds_and_spare_obstacles(shape: str):
 
 @pytest.mark.parametrize("noise", [{}, {"position": 0.0}, {"velocity": 0.0}])
 def test_the_adversary_leaves_less_room_than_chance(noise: dict[str, float]):
-    worst, chance = (room(simulate_scene(scene(shape, **noise))) for shape in ("adversarial", "uniform"))
+    worst, chance = (room(scene(shape, **noise)) for shape in ("adversarial", "uniform"))
     assert worst.min() > -1e-12  # and yet the set is sound
     assert worst.median() < 0.2 * chance.median()
 
 
-def room(measured: SimulatedScene) -> torch.Tensor:
+def room(config: SceneConfig) -> torch.Tensor:
     """Distance of each true goal to the nearest half-space of each sample, where there is one [m]."""
-    recording = measured.recording()
+    recording = simulate_scene(config).recording
     prior = FeasibleSet.from_box(recording.goals - 9.0, recording.goals + 9.0)
-    model = ObservationModel(recording.task, recording.barriers, noise=measured.config.noise.build())
+    model = ObservationModel(recording.task, recording.barriers, noise=config.noise.build())
     said = [evidence(model, prior, seen).omega for seen in recording.measurements]
     rows = torch.stack([omega.slack(recording.goals).amin(-1) for omega in said])
     return rows[rows < 0.99]  # padding has a slack of 1

@@ -1,5 +1,7 @@
 """The commands on logs as functions: a saved run gives the sets of the streaming observer, by objects as by files."""
 
+import hashlib
+import json
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +49,7 @@ def streamed(run: fsid.Trajectory) -> fsid.SetMembershipObserver:
 
 
 def test_a_saved_run_is_observed_like_the_run_itself(
-    run: fsid.Trajectory, saved: Path, streamed: fsid.SetMembershipObserver, tmp_path: Path
+    run: fsid.Trajectory, saved: Path, streamed: fsid.SetMembershipObserver, tmp_path: Path, undrawn: None
 ) -> None:
     (tmp_path / "config.yaml").write_text(CONFIG)
     ways = [
@@ -61,6 +63,10 @@ def test_a_saved_run_is_observed_like_the_run_itself(
         torch.testing.assert_close(found.sets.last_cut, streamed.feasible_set.last_cut)
         assert found.status_names == ["ok", "ok"]
         assert found.sets.contains(GOALS).all()
+    made = [json.loads((found.save(tmp_path / "out") / "regions.json").read_text())["made_from"] for found in ways]
+    assert made[0] == made[3] == {**made[2], "sha256": hashlib.sha256(saved.read_bytes()).hexdigest()}
+    assert made[2]["log"] == str(saved)
+    assert "sha256" not in made[1]  # a run, or a log in memory, is not the file that it may have come from
 
 
 def test_a_log_keeps_every_digit(run: fsid.Trajectory, saved: Path) -> None:

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tests.scenes_in_space import unit
+from tests.test_sets_in_space import unordered
 from torchfsid.halfspaces import Halfspaces
 from torchfsid.identification.evidence import ObservationModel, evidence
 from torchfsid.identification.normals import outward_normals
@@ -26,11 +27,9 @@ SATURATIONS = {
 }
 
 
-@pytest.mark.parametrize("name", SATURATIONS)
-@pytest.mark.parametrize("errors", [False, True], ids=["exact positions", "position errors"])
-def test_the_truth_is_inside(name: str, errors: bool) -> None:
-    """Rows that hold u back, directions, u and C theta + d are all wrong by up to their bounds."""
-    rng, count, m, saturation = np.random.default_rng(7), 60, 2, SATURATIONS[name]
+def scene(name: str, errors: bool, count: int = 60) -> tuple[ObservationModel, FeasibleSet, Measurement]:
+    """Rows that hold u back, directions, u and C theta + d are all wrong by up to their bounds. The truth is zero."""
+    rng, m, saturation = np.random.default_rng(7), 2, SATURATIONS[name]
     shift, turn = (0.05, rng.uniform(0, 0.2, (count, m))) if errors else (0.0, np.zeros((count, m)))
     delta, width = rng.uniform(1e-4, 0.03, count), np.exp(rng.uniform(np.log(0.02), np.log(3.0), (count, 1)))
     C, d = np.eye(3) + rng.uniform(-0.2, 0.2, (count, 3, 3)), rng.normal(size=(count, 3))
@@ -48,10 +47,26 @@ def test_the_truth_is_inside(name: str, errors: bool) -> None:
     prior = FeasibleSet.from_box(torch.from_numpy(middle - width / 2), torch.from_numpy(middle + width / 2))
     nobody = torch.zeros(count, 0, 3, dtype=torch.float64)
     seen = Measurement(0.0, torch.zeros(count, 3, dtype=torch.float64), torch.from_numpy(u), nobody, nobody[..., 0] > 0)
-    found = evidence(model, prior, seen)
-    assert int(found.informative.sum()) > count / 2
-    assert found.omega.slack(torch.zeros(count, 3, dtype=torch.float64))[found.informative].min() > -1e-8
+    return model, prior, seen
+
+
+@pytest.mark.parametrize("name", SATURATIONS)
+@pytest.mark.parametrize("errors", [False, True], ids=["exact positions", "position errors"])
+def test_the_truth_is_inside(name: str, errors: bool) -> None:
+    """And compiled code finds what torch finds, also where the model is not finite."""
+    model, prior, seen = scene(name, errors)
+    task, (barrier,) = model.task, model.barriers
+    assert isinstance(task, AffineTask)
+    assert isinstance(barrier, AffineBarrier)
+    barrier.b[0, 0], task.d[1, 1] = torch.nan, torch.inf
+    reference, found = (evidence(model, prior, seen, compiled) for compiled in (False, True))
+    assert int(found.informative.sum()) > len(seen.x) / 2
+    assert found.omega.slack(torch.zeros_like(seen.x))[found.informative].min() > -1e-8
     assert int((found.omega.A != 0).any(-1).any(-1).sum()) > 0
+    torch.testing.assert_close(found.informative, reference.informative)
+    for part in ("G", "f", "rank", "case"):
+        torch.testing.assert_close(getattr(found.kkt, part), getattr(reference.kkt, part), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(unordered(found.omega), unordered(reference.omega), rtol=1e-9, atol=1e-9)
 
 
 def around(u: tuple[float, float, float], radius: float = 0.01) -> Halfspaces:

@@ -129,6 +129,25 @@ def test_killed_twice_and_resumed_is_the_uninterrupted_sweep(config: Path, unint
     assert_same_tables(tmp_path, uninterrupted)
 
 
+def test_a_part_that_was_interrupted_is_run_again_and_keeps_its_records(
+    config: Path, uninterrupted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("experiments.sweeps.sweep.PARTS", 2)
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    for out in (whole, broken):
+        out.mkdir()
+    run_sweep(load_sweep(config), whole, untracked)
+    lines = (whole / "records.jsonl").read_bytes().splitlines(keepends=True)
+    (broken / "records.jsonl").write_bytes(b"".join(lines[:2]))
+    run_sweep(load_sweep(config), broken, untracked)
+    resumed = (broken / "records.jsonl").read_bytes().splitlines(keepends=True)
+    assert resumed[:2] == lines[:2]
+    assert sorted(json.loads(line)["run"] for line in resumed) == list(range(RUNS))
+    assert_same_tables(whole, broken)
+    alone, together = (read_table(out / "runs.parquet") for out in (uninterrupted, whole))
+    assert list(alone) == list(together)
+
+
 def test_a_dask_cluster_gives_the_same(config: Path, uninterrupted: Path, tmp_path: Path):
     # Workers in threads, reached over TCP: starting processes would take longer than the sweep.
     local = {"processes": False, "protocol": "tcp://", "dashboard_address": None}
@@ -204,8 +223,8 @@ def test_a_sweep_leaves_the_folder_of_a_run_alone(config: Path, tmp_path: Path, 
 def test_the_journal_keeps_every_whole_line(tmp_path: Path):
     path = tmp_path / "records.jsonl"
     with Journal(path) as journal:
-        journal.add({"run": 3, "row": {"a": 1}})
-        journal.add({"run": 1, "row": {"a": 2}})
+        journal.add([{"run": 3, "row": {"a": 1}}])
+        journal.add([{"run": 1, "row": {"a": 2}}])
     whole = path.read_bytes()
     for broken in (b"", b"{", b'{"run": 2, "row": {}}', b"\0\0\0"):
         path.write_bytes(whole + broken)
@@ -214,7 +233,7 @@ def test_the_journal_keeps_every_whole_line(tmp_path: Path):
             assert path.read_bytes() == whole
     path.write_bytes(b"\0\0\n" + whole)
     with Journal(path) as journal:
-        journal.add({"run": 0, "row": {}})
+        journal.add([{"run": 0, "row": {}}])
     with Journal(path) as journal:
         assert journal.records.keys() == {0, 1, 3}
 

@@ -13,14 +13,21 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import cache, lru_cache
 from importlib import import_module
+from math import prod
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchfsid.kernels.compiled import SIMULATED
 
 INSTALL = "pip install 'torchfsid[cuda]', with numba-cuda[cu12] or [cu13] where there is no CUDA toolkit"
+
+KINDS = {np.float64: torch.float64, np.int64: torch.int64, np.int32: torch.int32, np.bool_: torch.bool}
+
+SCRATCH = 2**30
+"""Largest size of the scratch of all threads of a kernel [bytes]."""
 
 
 @cache
@@ -94,6 +101,16 @@ def launch(kernel: str, tensors: Sequence[Sequence[Tensor]], values: Sequence[An
 def empty(shape: Sequence[int], like: Tensor, dtype: torch.dtype = torch.float64) -> Tensor:
     """A tensor on the device of another, with neighbouring items side by side. It is not filled."""
     return _reversed(torch.empty(tuple(shape)[::-1], dtype=dtype, device=like.device))
+
+
+def scratch(places: Sequence[tuple[Sequence[int], type]], items: int, like: Tensor) -> list[Tensor]:
+    """Tensors for the scratch of threads, with an entry of this shape and type of numpy for each thread, not filled.
+
+    There is a thread for each item, or as many as fit in `SCRATCH`. These handle several items one after the other.
+    """
+    each = sum(prod(shape) * np.dtype(kind).itemsize for shape, kind in places)
+    threads = min(items, max(SCRATCH // each, 1))
+    return [empty((threads, *shape), like, KINDS[kind]) for shape, kind in places]
 
 
 def side_by_side(tensor: Tensor) -> Tensor:

@@ -202,9 +202,12 @@ def finite(*tensors: Tensor) -> bool:
 
 def _largest(tensor: Tensor) -> float:
     """The largest |entry| of a tensor that is not empty. Numpy is the fastest on the CPU."""
-    return float(np.abs(array(tensor)).max() if tensor.is_cpu else tensor.detach().abs().amax())
+    if not tensor.is_cpu:
+        return float(tensor.detach().abs().amax())
+    values = array(tensor)
+    return max(float(values.max()), -float(values.min()))
 
 
 def array(tensor: Tensor) -> np.ndarray:
     """The tensor as a contiguous array on the CPU, which kernels take. It is copied only if it is not one already."""
-    return np.ascontiguousarray(tensor.numpy(force=True))
+    return np.ascontiguousarray(tensor.detach().contiguous().numpy(force=True))  # torch copies faster

@@ -22,7 +22,6 @@ from experiments.kinds import Track
 from experiments.results import write_rows
 from experiments.runs.config import CaseConfig, CasesConfig
 from experiments.runs.observe import observe
-from experiments.runs.observers import Observers
 from experiments.runs.recording import Recording
 from experiments.runs.saved import Results
 from experiments.runs.table import measure_cases
@@ -34,9 +33,8 @@ from torchfsid.robots.simulation import closed_loop
 
 def run_cases(config: CasesConfig, out: Path, track: Track) -> dict[str, Any]:
     """Simulate, observe, and return the summary."""
-    observers = Observers(config, record_cases(config))
-    observe(observers, out, track)
-    summary = measure_cases(config, Results(out, config), observers)
+    observers, tally = observe(config, record_cases(config), out, track)
+    summary = measure_cases(config, Results(out, config), observers, tally)
     write_rows(out / "cases.csv", summary["cases"])
     return summary
 
@@ -61,7 +59,7 @@ def record_cases(config: CasesConfig) -> Recording:
         goals=goals,
         task=controller.task,
         barriers=list(controller.barriers),
-        labels=[f"avoid {j + 1}" for j in range(_slots(config))],
+        labels=[f"avoid {j + 1}" for j in range(config.slots)],
         measurements=(
             sample.measurement
             for sample in closed_loop(controller, goals, start, around, dt=config.dt, samples=samples)
@@ -76,7 +74,7 @@ def _places(case: CaseConfig, config: CasesConfig) -> tuple[Tensor, Tensor, Tens
     Returns:
         Offsets (m, 2) from the robot at the start [m], radii (m,) [m], and which slots hold a body (m,).
     """
-    slots, taken = _slots(config), len(case.bodies)
+    slots, taken = config.slots, len(case.bodies)
     (avoidance,) = config.barriers
     gamma, margin = known(avoidance.class_k.gain), known(avoidance.margin)
     assert gamma is not None
@@ -92,10 +90,6 @@ def _places(case: CaseConfig, config: CasesConfig) -> tuple[Tensor, Tensor, Tens
         offsets[j] = distance * normal
         radii[j] = body.radius
     return offsets, radii, torch.arange(slots) < taken
-
-
-def _slots(config: CasesConfig) -> int:
-    return max(len(case.bodies) for case in config.cases)
 
 
 def _rotation(angle: float) -> Float[Tensor, "2 2"]:

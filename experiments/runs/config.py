@@ -293,6 +293,11 @@ class CasesConfig(ExperimentConfig):
     spin: Number = 0.0
     cases: Annotated[tuple[CaseConfig, ...], Field(min_length=1)]
 
+    @property
+    def slots(self) -> int:
+        """The largest number of bodies of a case."""
+        return max(len(case.bodies) for case in self.cases)
+
     @model_validator(mode="after")
     def _is_a_table(self) -> CasesConfig:
         self._require_in_prior(self.goal, "goal")

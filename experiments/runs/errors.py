@@ -10,6 +10,7 @@ error that makes the observer report a violated row is preferred to all others.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,73 +18,67 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from experiments.runs.config import SceneConfig
+from experiments.runs.batch import Batch
 from torchfsid.identification.evidence import ObservationModel, evidence
-from torchfsid.robots.barriers import Barrier, stack_barriers
-from torchfsid.robots.measurement import Measurement
+from torchfsid.robots.barriers import stack_barriers
 from torchfsid.robots.simulation import Trajectory
 
 DIRECTIONS = 8
 
 
-def measure(true: Trajectory, config: SceneConfig) -> Trajectory:
-    """The trajectory with errors of measurement. Obstacles are known exactly."""
-    random = np.random.default_rng(np.random.SeedSequence(config.seed))
-    noise, robots = config.measurement_noise, true.robots
-    if noise.shape == "adversarial":
-        return _worst(true, config, random)
-    of_all = (len(true.t), robots)
-    (inside, surface) = (in_disc, _on_circle) if true.x.shape[-1] == 2 else (_in_ball, _on_sphere)
-    draw, shape = (inside, of_all) if noise.shape == "uniform" else (surface, (robots,))
-    x, u = true.x.clone(), true.u.clone()
-    x[:, :robots] += draw(random, noise.position, shape)
-    if true.velocity is None:
-        u[:, :robots] += draw(random, noise.velocity, shape)
-        return replace(true, x=x, u=u)
-    velocity = true.velocity.clone()
-    velocity[:, :robots] += draw(random, noise.velocity, shape)
-    u[:, :robots] += draw(random, noise.acceleration, shape)
+def measure(batch: Batch) -> Trajectory:
+    """The batch's true trajectories with errors of measurement. Obstacles are known exactly."""
+    true, generators = batch.true, [np.random.default_rng(np.random.SeedSequence(of.seed)) for of in batch.scenes]
+    if batch.scenes[0].measurement_noise.shape == "adversarial":
+        return _worst(batch, generators)
+    x, u, velocity = true.x.clone(), true.u.clone(), None if true.velocity is None else true.velocity.clone()
+    (inside, surface) = (in_disc, on_circle) if x.shape[-1] == 2 else (_in_ball, _on_sphere)
+    for i, (scene, random) in enumerate(zip(batch.scenes, generators, strict=True)):
+        noise, robots = scene.measurement_noise, len(scene.robots)
+        draw, shape = (inside, (len(true.t), robots)) if noise.shape == "uniform" else (surface, (robots,))
+        of_control = noise.velocity if velocity is None else noise.acceleration
+        x[:, i, :robots] += draw(random, noise.position, shape)
+        if velocity is not None:
+            velocity[:, i, :robots] += draw(random, noise.velocity, shape)
+        u[:, i, :robots] += draw(random, of_control, shape)
     return replace(true, x=x, u=u, velocity=velocity)
 
 
-def _worst(true: Trajectory, config: SceneConfig, random: np.random.Generator) -> Trajectory:
-    noise, robots = config.measurement_noise, true.robots
-    goals = torch.tensor([robot.goal for robot in config.robots], dtype=torch.float64)
-    barriers: list[Barrier] = [barrier.build(config.bodies) for barrier in config.barriers]
+def _worst(batch: Batch, generators: Sequence[np.random.Generator]) -> Trajectory:
+    true, team, robots, places = batch.true, batch.team, batch.robots, batch.places
+    noises = [scene.measurement_noise for scene in batch.scenes]
+    lengths = torch.tensor([[noise.position, noise.velocity] for noise in noises], dtype=torch.float64)[team].T
     compass = 2 * math.pi * torch.arange(DIRECTIONS, dtype=torch.float64) / DIRECTIONS
     # A length of zero needs no direction.
-    turns = torch.cartesian_prod(compass if noise.position else compass[:1], compass if noise.velocity else compass[:1])
-    candidates = goals.repeat(len(turns), 1)
-    model = ObservationModel(config.task.build(config.bodies, config.dimension), barriers, noise=config.noise.build())
-    prior = config.prior.build(len(candidates))
-    x, u = true.x.clone(), true.u.clone()
-    x[0, :robots] += _on_circle(random, noise.position, (robots,))
-    u[0, :robots] += _on_circle(random, noise.velocity, (robots,))
+    turns = torch.cartesian_prod(*(compass if bool(length.any()) else compass[:1] for length in lengths))
+    candidates, tries = batch.goals.repeat(len(turns), 1), torch.arange(len(team)).repeat(len(turns))
+    model, of_tries = batch.model(team), batch.model(team[tries])
+    declared = ObservationModel(of_tries.task, of_tries.barriers, noise=of_tries.noise)
+    prior = batch.scenes[0].prior.build(len(candidates))
+    measured = replace(true, x=true.x.clone(), u=true.u.clone())
+    for i, (noise, random) in enumerate(zip(noises, generators, strict=True)):
+        count = (int((team == i).sum()),)
+        measured.x[0, i, : count[0]] += on_circle(random, noise.position, count)
+        measured.u[0, i, : count[0]] += on_circle(random, noise.velocity, count)
     for k in range(len(true.t)):
-        x_error, u_error = (seen[max(k - 1, 0)] - exact[max(k - 1, 0)] for seen, exact in ((x, true.x), (u, true.u)))
-        before = u[k - 1] if k > 0 else torch.zeros_like(u[0])
-        seen = Measurement.of_team(
-            float(true.t[k]), true.x[k] + x_error, true.u[k] + u_error,
-            robots=range(robots), previous_u=before, radius=true.radius,
-        )  # fmt: skip
-        exact = true.measurement(k)
-        rows = stack_barriers(barriers, exact).normalised()
+        if k > 0:  # until they are chosen, the errors are those of one sample before
+            for seen, exact in ((measured.x, true.x), (measured.u, true.u)):
+                seen[k] += seen[k - 1] - exact[k - 1]
+        exact, seen = batch.of_robots(true.measurement(k)), batch.of_robots(measured.measurement(k))
+        rows = stack_barriers(model.barriers, exact).normalised()
         assert exact.u is not None
         nearest = rows.slack(exact.u).argmin(-1)
-        normal = rows.A[torch.arange(robots), nearest]
+        normal = rows.A[torch.arange(len(team)), nearest]
         angles = torch.atan2(normal[:, 1], normal[:, 0]) + turns.T.unsqueeze(-1)  # (position or velocity, turn, robot)
-        x_moves, u_moves = noise.position * _towards(angles[0]), noise.velocity * _towards(angles[1])
-        tried = replace(
-            seen.select(torch.arange(robots).repeat(len(turns))),
-            x=(exact.x + x_moves).flatten(0, 1),
-            u=(exact.u + u_moves).flatten(0, 1),
-        )
-        found = evidence(model, prior, tried)
+        x_moves, u_moves = lengths[:, None, :, None] * _towards(angles)
+        tried = replace(seen.select(tries), x=(exact.x + x_moves).flatten(0, 1), u=(exact.u + u_moves).flatten(0, 1))
+        found = evidence(declared, prior, tried)
         room = found.omega.slack(candidates).amin(-1).masked_fill(found.alarmed, -math.inf)
-        worst = room.reshape(len(turns), robots).argmin(0)
-        x[k, :robots] = exact.x + x_moves[worst, torch.arange(robots)]
-        u[k, :robots] = exact.u + u_moves[worst, torch.arange(robots)]
-    return replace(true, x=x, u=u)
+        worst = room.reshape(len(turns), len(team)).argmin(0)
+        for of_bodies, exactly, moves in ((measured.x, exact.x, x_moves), (measured.u, exact.u, u_moves)):
+            chosen = exactly + moves[worst, torch.arange(len(team))]
+            of_bodies[k, team, places % robots] = chosen
+    return measured
 
 
 def in_disc(random: np.random.Generator, radius: float, shape: tuple[int, ...]) -> Float[Tensor, "*shape 2"]:
@@ -93,7 +88,8 @@ def in_disc(random: np.random.Generator, radius: float, shape: tuple[int, ...]) 
     return torch.from_numpy(np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=-1))
 
 
-def _on_circle(random: np.random.Generator, radius: float, shape: tuple[int, ...]) -> Float[Tensor, "*shape 2"]:
+def on_circle(random: np.random.Generator, radius: float, shape: tuple[int, ...]) -> Float[Tensor, "*shape 2"]:
+    """Points uniformly distributed on a circle."""
     return radius * _towards(torch.from_numpy(random.uniform(0, 2 * np.pi, size=shape)))
 
 

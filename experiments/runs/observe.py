@@ -13,8 +13,10 @@ from torch import Tensor
 
 from experiments.kinds import Track
 from experiments.results import Appender
+from experiments.runs.config import ExperimentConfig
 from experiments.runs.observers import Observers
 from experiments.runs.recording import Recording
+from experiments.runs.tally import Tally
 from torchfsid.commands.results import ResultsWriter
 from torchfsid.commands.safety_results import without_repeats
 from torchfsid.observers.set_membership import SetEstimate
@@ -23,9 +25,10 @@ from torchfsid.robots.barriers import stack_barriers
 from torchfsid.robots.measurement import Measurement
 
 
-def observe(observers: Observers, out: Path, track: Track) -> None:
+def observe(config: ExperimentConfig, recording: Recording, out: Path, track: Track) -> tuple[Observers, Tally]:
     """Observe the recording and write the files. A sample is on disk before the next one is observed."""
-    recording = observers.recording
+    observers = Observers(config, recording.task, recording.barriers, len(recording.robots))
+    tally = Tally.before(config, recording.goals)
     first, *others = observers.sets
     alongside = {kind: observers.sets[kind] for kind in others}
     with (
@@ -34,8 +37,10 @@ def observe(observers: Observers, out: Path, track: Track) -> None:
     ):
         for measurement in track(recording.measurements, "Observing", recording.samples):
             estimate, sets = observers.update(measurement)
+            tally.update(estimate, sets, config.dt)
             results.write(measurement, estimate, {kind: sets[kind] for kind in others})
             regions.append("".join(json.dumps(line) + "\n" for line in _regions(recording, measurement, sets)))
+    return observers, tally
 
 
 def _regions(recording: Recording, measurement: Measurement, sets: dict[str, SetEstimate]) -> Iterator[dict[str, Any]]:

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from experiments.runs.batch import Batch
 from experiments.runs.config import SceneConfig
 from experiments.runs.errors import measure
 from torchfsid.robots.barriers import Barrier
-from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement
-from torchfsid.robots.simulation import Trajectory, simulate
+from torchfsid.robots.simulation import Trajectory
 from torchfsid.robots.tasks import Task
 
 
@@ -41,46 +41,25 @@ class Recording:
     samples: int
 
 
-@dataclass(frozen=True)
-class SimulatedScene:
-    """A scene that was run: its true trajectory, and the one measured with errors."""
+class SimulatedScene(NamedTuple):
+    """A scene that was run: its true trajectory, the one measured with errors, and the recording of its robots."""
 
-    config: SceneConfig
-    task: Task
-    barriers: list[Barrier]
     true: Trajectory
     measured: Trajectory
-
-    def recording(self) -> Recording:
-        """The recording of the scene's robots."""
-        return Recording(
-            robots=[robot.name for robot in self.config.robots],
-            goals=_points([robot.goal for robot in self.config.robots], self.config.dimension),
-            task=self.task,
-            barriers=self.barriers,
-            labels=[label for barrier in self.barriers for label in barrier.labels(self.config.bodies)],
-            measurements=self.measured.measurements(),
-            samples=len(self.measured.t),
-        )
+    recording: Recording
 
 
 def simulate_scene(config: SceneConfig) -> SimulatedScene:
     """Run the scene's robots from rest in closed loop, and measure them with the configured errors."""
-    task = config.task.build(config.bodies, config.dimension)
-    barriers: list[Barrier] = [barrier.build(config.bodies) for barrier in config.barriers]
-    start = _points([robot.start for robot in config.robots], config.dimension)
-    true = simulate(
-        CbfQpController(task, barriers),
-        _points([robot.goal for robot in config.robots], config.dimension),
-        start,
-        dt=config.dt,
-        steps=config.steps,
-        velocity=torch.zeros_like(start) if config.dynamics == "double_integrator" else None,
-        obstacles=_points([obstacle.position for obstacle in config.obstacles], config.dimension),
-        radius=None if config.radius is None else torch.full((len(config.bodies),), config.radius, dtype=torch.float64),
+    batch = Batch([config])
+    model, measured = batch.model(batch.team), measure(batch).team(0)
+    recording = Recording(
+        robots=[robot.name for robot in config.robots],
+        goals=batch.goals,
+        task=model.task,
+        barriers=model.barriers,
+        labels=[label for barrier in model.barriers for label in barrier.labels(config.bodies)],
+        measurements=measured.measurements(),
+        samples=len(measured.t),
     )
-    return SimulatedScene(config, task, barriers, true, measure(true, config))
-
-
-def _points(points: list[tuple[float, ...]], n: int) -> Float[Tensor, "points n"]:
-    return torch.tensor(points, dtype=torch.float64).reshape(-1, n)
+    return SimulatedScene(batch.true.team(0), measured, recording)

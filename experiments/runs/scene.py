@@ -11,7 +11,6 @@ from experiments.kinds import Track
 from experiments.results import write_rows
 from experiments.runs.config import SceneConfig
 from experiments.runs.observe import observe
-from experiments.runs.observers import Observers
 from experiments.runs.recording import simulate_scene
 from experiments.runs.saved import Results
 from experiments.runs.summary import summarise_scene
@@ -22,9 +21,8 @@ def run_scene(config: SceneConfig, out: Path, track: Track) -> dict[str, Any]:
     """Simulate, observe, and return the summary."""
     scene = simulate_scene(config)
     write_trajectory(out / "trajectory.csv", config.bodies, scene.measured)
-    observers = Observers(config, scene.recording())
-    observe(observers, out, track)
-    return summarise_scene(config, Results(out, config), observers, scene.true)
+    observers, tally = observe(config, scene.recording, out, track)
+    return summarise_scene(config, Results(out, config), observers, tally, scene.true)
 
 
 def write_trajectory(path: Path, bodies: list[str], measured: Trajectory) -> None:

@@ -16,15 +16,18 @@ from experiments.runs.config import ExpectedConfig, ExperimentConfig, SceneConfi
 from experiments.runs.lengths import lengths, prior_lengths
 from experiments.runs.observers import Observers
 from experiments.runs.saved import Results
+from experiments.runs.tally import Tally
 from torchfsid.robots.simulation import Trajectory
 
 SHARES = (0.1, 0.01)
 
 
-def summarise_scene(config: SceneConfig, results: Results, observers: Observers, true: Trajectory) -> dict[str, Any]:
+def summarise_scene(
+    config: SceneConfig, results: Results, observers: Observers, tally: Tally, true: Trajectory
+) -> dict[str, Any]:
     """The content of summary.json."""
     active = {robot: [at[i].active for at in results.regions] for i, robot in enumerate(results.robots)}
-    measures, before, tally = lengths(results), prior_lengths(results), observers.tally
+    measures, before = lengths(results), prior_lengths(results)
 
     def per_robot(values: list | np.ndarray | Tensor) -> dict[str, Any]:
         return dict(zip(results.robots, values if isinstance(values, list) else values.tolist(), strict=True))

@@ -17,6 +17,7 @@ from experiments.runs.config import SETS, CasesConfig
 from experiments.runs.observers import Observers
 from experiments.runs.saved import Results
 from experiments.runs.summary import settings
+from experiments.runs.tally import Tally
 from experiments.tables import table
 from torchfsid.config.quantities import known
 
@@ -30,18 +31,18 @@ PAPER = {"A": ("yes", "yes"), "B": ("yes", "yes"), "C": ("yes", "yes"), "D": ("n
 """Table I: is point-wise, is region-based identification possible?"""
 
 
-def measure_cases(config: CasesConfig, results: Results, observers: Observers) -> dict[str, Any]:
+def measure_cases(config: CasesConfig, results: Results, observers: Observers, tally: Tally) -> dict[str, Any]:
     """The content of summary.json. Its `cases` are also the content of cases.csv."""
     return {
         "title": config.title,
         "settings": settings(config) | {"spin": config.spin, "goal": list(config.goal)},
-        "steps": observers.tally.samples,
-        "cases": [_measure(i, config, results, observers) for i in range(len(config.cases))],
+        "steps": tally.samples,
+        "cases": [_measure(i, config, results, observers, tally) for i in range(len(config.cases))],
     }
 
 
-def _measure(i: int, config: CasesConfig, results: Results, observers: Observers) -> dict[str, Any]:
-    case, tally, gain = config.cases[i], observers.tally, known(config.task.gain) or 0.0
+def _measure(i: int, config: CasesConfig, results: Results, observers: Observers, tally: Tally) -> dict[str, Any]:
+    case, gain = config.cases[i], known(config.task.gain) or 0.0
     duration = config.dt * tally.samples
     information_rank = int(torch.linalg.matrix_rank(tally.information[i], atol=RANK_TOLERANCE * gain**2 * duration))
     error = results.error("ukf_0", "ukf_1")[:, i]
@@ -75,7 +76,7 @@ def _measure(i: int, config: CasesConfig, results: Results, observers: Observers
             f"{kind}_area_grew": int(of.grew[i]),
         }
     facets = observers.sets["critical_region"].feasible_set.facets()
-    source, rows = facets.source[i][(facets.halfspaces.A[i] != 0).any(-1)], len(observers.recording.labels)
+    source, rows = facets.source[i][(facets.halfspaces.A[i] != 0).any(-1)], config.slots
     return row | {
         "facets_of_prior": int((source < 0).sum()),
         "facets_of_inactive_rows": int(((source >= 0) & (source < rows)).sum()),

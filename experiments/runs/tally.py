@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from experiments.runs.config import ExperimentConfig
 from torchfsid.observers.hybrid import HybridEstimate
 from torchfsid.observers.set_membership import SetEstimate
 from torchfsid.sets.feasible_set import FeasibleSet
@@ -69,6 +70,14 @@ class Tally:
     samples: int = 0
     information: Float[Tensor, "B 2 2"] = field(init=False)
     rank: Int[Tensor, "B"] = field(init=False)
+
+    @classmethod
+    def before(cls, config: ExperimentConfig, goals: Float[Tensor, "B 2"]) -> Tally:
+        """The counts before the first sample."""
+        volume = config.prior.build(len(goals)).volume()
+        variances = torch.tensor(config.ukf.spread(config.prior), dtype=torch.float64) ** 2
+        counts = {kind: SetTally(volume) for kind in config.sets}
+        return cls(goals, counts, torch.diag(variances).expand(len(goals), -1, -1))
 
     def __post_init__(self) -> None:
         self.covariance = self.prior_covariance

@@ -13,7 +13,6 @@ results. The journal of finished runs and two tables are written first, then the
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -26,11 +25,12 @@ import torch
 from torch import Tensor
 
 from experiments.figures.safety_parameters import draw_study
-from experiments.results import whole, write_rows
+from experiments.results import write_rows
 from experiments.studies.safety_summary import TARGET, as_markdown, tables
 from experiments.studies.safety_teams import Form, Prior, Setting, Team, draw, logged
 from experiments.sweeps.journal import Journal
 from experiments.sweeps.workers import workers
+from torchfsid.commands.results_folder import write_json
 from torchfsid.commands.terminal import track
 from torchfsid.observers.safety import SafetyObserver
 from torchfsid.outcome import Status
@@ -243,7 +243,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         np.random.default_rng(chosen.seed).shuffle(missing)  # so that all parts progress together
         calls = ((runs[number], number, chosen.seed) for number in missing)
         for done in track(team(record, calls), "Learning", len(runs), len(runs) - len(missing)):
-            journal.add(done)
+            journal.add([done])
         records = [journal.records[number] for number in runs]
         large = [row for each in records for row in each["robots"] if row["looked"] > TARGET * row["known"]]
         large = [row for row in large if row["part"] != "odd"]
@@ -254,11 +254,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in ("sets", "robots"):
         write_rows(chosen.out / f"{name}.csv", (row for each in records for row in each[name]))
     shapes = [shape for each in records for shape in each["shapes"]]
-    with whole(chosen.out / "shapes.json") as partial:
-        partial.write_text(json.dumps(shapes), encoding="utf-8")
+    write_json(chosen.out / "shapes.json", shapes)
     summary = dict(tables(chosen.out))
-    with whole(chosen.out / "summary.json") as partial:
-        partial.write_text(json.dumps(summary, indent=1), encoding="utf-8")
+    write_json(chosen.out / "summary.json", summary)
     for title, rows in summary.items():
         print(as_markdown(title, rows))
     draw_study(chosen.out).savefig(chosen.out / "figure.png", dpi=200)

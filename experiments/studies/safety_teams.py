@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from experiments.runs.errors import in_disc
+from experiments.runs.errors import in_disc, on_circle
 from experiments.teams import TeamConfig
 from torchfsid.halfspaces import dot
 from torchfsid.identification.safety_parameters import Possible
@@ -191,7 +191,7 @@ def logged(team: Team, setting: Setting, random: np.random.Generator) -> Traject
     true, robots = team.true, team.robots
     of_all = len(true.t), robots
     x = true.x.clone()
-    x[:, :robots] += setting.position * _directions(random, of_all)
+    x[:, :robots] += setting.position * on_circle(random, 1.0, of_all)
     seen, moving = replace(true, x=x), (true.u[:, :robots] != 0).any(-1, keepdim=True)
     if setting.errors == "adversarial":
         return _worst(team, seen, setting, random)
@@ -199,8 +199,8 @@ def logged(team: Team, setting: Setting, random: np.random.Generator) -> Traject
         "exact": lambda: torch.zeros(*of_all, 2, dtype=torch.float64),
         "tenth": lambda: in_disc(random, 0.1, of_all),
         "uniform": lambda: in_disc(random, 1.0, of_all),
-        "circle": lambda: _directions(random, of_all),
-        "fixed": lambda: _directions(random, (1, robots)),
+        "circle": lambda: on_circle(random, 1.0, of_all),
+        "fixed": lambda: on_circle(random, 1.0, (1, robots)),
         "alternating": lambda: _alternating(team),
     }
     u = true.u.clone()
@@ -234,7 +234,7 @@ def _worst(team: Team, seen: Trajectory, setting: Setting, random: np.random.Gen
     observer = team.learner(setting, Prior())
     turns = (2 * math.pi * torch.arange(DIRECTIONS, dtype=torch.float64) / DIRECTIONS).repeat_interleave(robots)
     robot = torch.arange(robots).repeat(DIRECTIONS)
-    error = _directions(random, (robots,))
+    error = on_circle(random, 1.0, (robots,))
     for k in range(len(true.t)):
         moving = (true.u[k, :robots] != 0).any(-1, keepdim=True)
         u[k, :robots] += torch.where(moving, setting.velocity * error, 0.0)
@@ -259,12 +259,6 @@ def _worst(team: Team, seen: Trajectory, setting: Setting, random: np.random.Gen
         u[k, :robots] = true.u[k, :robots] + torch.where(moving, setting.velocity * error, 0.0)
         observer.update(replace(seen, u=u).measurement(k))
     return replace(seen, u=u)
-
-
-def _directions(random: np.random.Generator, shape: tuple[int, ...]) -> Float[Tensor, "*shape 2"]:
-    """Random unit vectors."""
-    angle = torch.from_numpy(random.uniform(0, 2 * np.pi, size=shape))
-    return torch.stack([angle.cos(), angle.sin()], dim=-1)
 
 
 def _log_uniform(random: np.random.Generator, ends: Interval) -> float:

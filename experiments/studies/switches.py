@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from experiments.design.probe import Probing, slope
+from experiments.results import rows_of
 from torchfsid.identification.evidence import evidence
 
 REACH = 0.1
@@ -46,8 +47,7 @@ def across(probing: Probing, place: Float[Tensor, "2"], goal: Float[Tensor, "2"]
         "by_derivatives": torch.cat([log_area[:1], log_area[0] + torch.cumulative_trapezoid(slopes, y)]),
         "switches": torch.cat([switched.new_zeros(1), switched.cumsum(0)]),
     }
-    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
-    return [dict(zip(columns, row, strict=True)) for row in rows]
+    return rows_of({name: column.tolist() for name, column in columns.items()})
 
 
 def summarise_switches(rows: list[dict[str, Any]]) -> dict[str, float]:

@@ -11,8 +11,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -125,43 +124,36 @@ class Ending:
     strained_silent: int
 
 
-def simulated(task: Task, seeds: int) -> tuple[list[Trajectory], Tensor]:
-    """One run per seed, and the goals of all robots [m]."""
-    runs, goals = [], []
-    for sequence in torch.arange(seeds).tolist():
-        generator = torch.Generator().manual_seed(sequence)
-
-        def uniform(*shape: int, generator: torch.Generator = generator) -> Tensor:
-            return torch.rand(*shape, generator=generator, dtype=torch.float64)
-
-        turn = 2 * math.pi * (torch.arange(ROBOTS) + 0.6 * uniform(ROBOTS)) / ROBOTS
-        circle = torch.stack([turn.cos(), turn.sin()], dim=-1)
-        goal = -circle * (1.6 + 0.6 * uniform(ROBOTS, 1)) + 0.3 * (uniform(ROBOTS, 2) - 0.5)
-        controller = CbfQpController(task, [AVOIDANCE])
-        runs.append(simulate(controller, goal, 2.0 * circle, dt=DT, steps=STEPS, obstacles=PILLARS))
-        goals.append(goal)
-    return runs, torch.cat(goals)
+def simulated(task: Task, seeds: int) -> tuple[Trajectory, Tensor]:
+    """One team per seed, and the goals of all robots [m]."""
+    circles, goals = [], []
+    for seed in range(seeds):
+        turn, distance, aside = uniform(torch.Generator().manual_seed(seed), (ROBOTS,), (ROBOTS, 1), (ROBOTS, 2))
+        circles.append(directions(2 * math.pi * (torch.arange(ROBOTS) + 0.6 * turn) / ROBOTS))
+        goals.append(-circles[-1] * (1.6 + 0.6 * distance) + 0.3 * (aside - 0.5))
+    controller, goal = CbfQpController(task, [AVOIDANCE]), torch.stack(goals)
+    run = simulate(controller, goal, 2.0 * torch.stack(circles), dt=DT, steps=STEPS, obstacles=PILLARS)
+    return run, goal.flatten(0, 1)
 
 
-def measured(runs: Sequence[Trajectory], error: float) -> list[Measurement]:
-    """The robots of all runs as one batch, with velocity errors of this size [m/s]."""
-    generator = torch.Generator().manual_seed(len(runs))
-    noisy = []
-    for run in runs:
-        turn = 2 * math.pi * torch.rand(run.u.shape[:2], generator=generator, dtype=torch.float64)
-        away = torch.stack([turn.cos(), turn.sin()], dim=-1)
-        away[:, ROBOTS:] = 0.0
-        noisy.append(replace(run, u=run.u + error * away))
-    return [joined([run.measurement(k) for run in noisy]) for k in range(STEPS + 1)]
+def measured(run: Trajectory, error: float) -> list[Measurement]:
+    """The robots of all teams as one batch, with velocity errors of this size [m/s]."""
+    samples, teams, bodies, _ = run.u.shape
+    turns = uniform(torch.Generator().manual_seed(teams), *[(samples, bodies)] * teams)
+    away = directions(2 * math.pi * torch.stack(turns, dim=1))
+    away[..., ROBOTS:, :] = 0.0
+    noisy = replace(run, u=run.u + error * away)
+    return [noisy.measurement(k).flattened() for k in range(samples)]
 
 
-def joined(teams: Sequence[Measurement]) -> Measurement:
-    """The measurements of several teams as one batch."""
-    columns: dict[str, Any] = {}
-    for field in fields(Measurement):
-        values = [getattr(team, field.name) for team in teams]
-        columns[field.name] = torch.cat(values) if isinstance(values[0], Tensor) else values[0]
-    return Measurement(**columns)
+def uniform(generator: torch.Generator, *shapes: tuple[int, ...]) -> list[Tensor]:
+    """Random numbers between 0 and 1."""
+    return [torch.rand(shape, generator=generator, dtype=torch.float64) for shape in shapes]
+
+
+def directions(angle: Tensor) -> Tensor:
+    """Unit vectors."""
+    return torch.stack([angle.cos(), angle.sin()], dim=-1)
 
 
 def ending(belief: Belief, samples: list[Measurement], goals: Tensor, noise: NoiseBound) -> Ending:
@@ -230,10 +222,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     heads = (*heads, "useless") if chosen.auto else heads
     print(f"| {' | '.join(heads)} |\n|{'---|' * len(heads)}")
     for belief in BELIEFS:
-        trajectories, goals = runs[belief.run]
+        trajectory, goals = runs[belief.run]
         for bound, size in LEVELS:
             errors = belief.errors * size if size else (belief.errors - 1.0) * bound
-            samples = belief.seen(measured(trajectories, errors))
+            samples = belief.seen(measured(trajectory, errors))
             declared = NoiseBound(bound, neighbour_velocity=bound)
             label = f"{bound:g}"
             if chosen.auto:

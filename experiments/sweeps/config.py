@@ -3,13 +3,13 @@
 `experiment` is a scene (`experiments.runs.config`) without what the sweep fills in: `title`, `seed`, `snapshots`, and
 with a `team`, `robots` and `obstacles`. Every point of the grid is run `repeats` times. Run i draws all its random
 numbers from child i of one `numpy.random.SeedSequence`. So it is the same run in any order, on any number of workers.
-This module does not import torch.
+The filter is the compiled one where it can be used, unless `ukf.engine` says otherwise. This module does not import
+torch.
 """
 
 from __future__ import annotations
 
 import itertools
-import json
 from collections import ChainMap
 from collections.abc import Iterable
 from functools import cached_property
@@ -20,7 +20,7 @@ from pydantic import Field, model_validator
 
 from experiments.runs.config import Count, SceneConfig, Text, WholeNumber, require_increasing
 from experiments.teams import TeamConfig
-from torchfsid.config.documents import Strict, apply_overrides, validate, wrong
+from torchfsid.config.documents import Strict, apply_overrides, validate, with_value, wrong
 from torchfsid.config.quantities import NonNegative, PlanarVector, require_interval
 from torchfsid.errors import ConfigError
 
@@ -87,7 +87,9 @@ class SweepConfig(Strict):
     def scene_mapping(self, run: int) -> dict[str, Any]:
         """The scene of a run as a mapping, not yet validated."""
         values = {**self.point(run), **self.drawn(run)}
-        mapping = apply_overrides(self.experiment, [f"{key}={json.dumps(value)}" for key, value in values.items()])
+        mapping: Any = self.experiment
+        for key, value in values.items():
+            mapping = with_value(mapping, [part.strip() for part in key.split(".")], value, f"grid, draw: {key}")
         _, placing, measuring = self._seeds(run)
         if "team" in mapping:
             team = validate({"team": mapping.pop("team")}, _Team, "experiment").team

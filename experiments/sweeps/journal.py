@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +31,11 @@ class Journal(Appender):
         records = filter(None, map(_parse, lines))
         self.records: dict[int, dict[str, Any]] = {record["run"]: record for record in records}
 
-    def add(self, record: dict[str, Any]) -> None:
-        """Append a record. After the return it survives a crash."""
-        self.append(json.dumps(record, allow_nan=False) + "\n")
+    def add(self, records: Sequence[dict[str, Any]]) -> None:
+        """Append records. After the return they survive a crash."""
+        self.append("".join(json.dumps(record, allow_nan=False) + "\n" for record in records))
         os.fsync(self.file.fileno())
-        self.records[record["run"]] = record
+        self.records |= {record["run"]: record for record in records}
 
 
 def _parse(line: bytes) -> dict[str, Any] | None:

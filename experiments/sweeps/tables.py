@@ -10,8 +10,9 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 
-from experiments.results import Columns, reading, whole
+from experiments.results import Columns, reading
 from experiments.sweeps.config import SweepConfig
+from torchfsid.commands.results_folder import whole
 
 
 def write_tables(out: Path, config: SweepConfig, records: list[dict[str, Any]]) -> None:

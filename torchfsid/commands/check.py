@@ -150,7 +150,8 @@ class Check:
                     f"{name} at {self.declared:.3g} {self.unit}: {_count(faults)}, the first at "
                     f"{self.clock(first.first)} ({first.row}), most by {most} ({_count(faults, most)}){look_at}"
                 )
-        lines += [] if self.safety is None else [self.safety.conclusion()]
+        if self.safety is not None and not (self._suggestion and self.safety.verdict == "neither"):
+            lines.append(self.safety.conclusion())  # if neither is wrong, something else is, which may be named already
         if self.smallest_bound <= self.declared:
             lines.append(self._consistent())
         return [*lines, *self.clock.sentence()]

@@ -89,7 +89,7 @@ class DeclaredLog:
             raise ConfigError(f"{self.log.source}: no two bodies share a time, so none would ever see another")
         if config.is_second_order:
             noise = config.noise.build_others()
-            self.log = self.log if config.velocity == "logged" else self.log.accelerated(noise.arrival)
+            self.log = self.log if config.velocity == "logged" else self.log.accelerated(float(noise.arrival))
         else:
             self.log = self.log.of_first_order()
             if config.velocity == "windows":

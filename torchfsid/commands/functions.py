@@ -19,6 +19,7 @@ from torchfsid.commands.check import check as check_declared
 from torchfsid.commands.declared_log import DeclaredLog
 from torchfsid.commands.observe import Observation
 from torchfsid.commands.observed import Observed
+from torchfsid.commands.provenance import made_from
 from torchfsid.config.bags import BagConfig
 from torchfsid.config.documents import read_yaml, validate
 from torchfsid.config.models import models_in
@@ -96,7 +97,8 @@ def observe(
         LogError: the log cannot be read.
         FsidError: no parameter explains a robot, and `on_inconsistent` is `raise`.
     """
-    return Observed(Observation(_declared(log, task, barriers, prior, noise, config, options)))
+    declared = _declared(log, task, barriers, prior, noise, config, options)
+    return Observed(Observation(declared), made_from(Path(log) if isinstance(log, str | Path) else declared.log))
 
 
 def check(

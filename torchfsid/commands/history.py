@@ -18,11 +18,12 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Bool
-from torch import Tensor
 
-from torchfsid.commands.table_file import TableFile, number, texts
+from torchfsid.commands.table_file import TableFile, line_of, lines_of, number, texts
+from torchfsid.halfspaces import array
 from torchfsid.logs.log import Log
 from torchfsid.observers.set_membership import SetEstimates
 from torchfsid.sets.feasible_set import FeasibleSet
@@ -91,7 +92,10 @@ class MotionFile(TableFile):
         axes, sizes = "xyz"[: log.x.shape[-1]], [] if log.radius is None else ["radius"]
         super().__init__(path, ["t", "robot", *axes, *(f"v{axis}" for axis in axes), *sizes, "active"])
         self._log, self._labels = log, labels
-        self._place = {robot: i for i, robot in enumerate(robots)}
+        self._robots = [log.bodies.index(robot) for robot in robots]
+        self._names = [line_of([body]) for body in log.bodies]
+        self._radius = [[]] * len(log.bodies) if log.radius is None else texts(log.radius[:, None])
+        self._cells: dict[bytes, str] = {}
         self._stride, self._sample = max(1, math.ceil((len(log.t) - 1) / (MOST_TIMES - 1))), 0
 
     def see(self, estimates: SetEstimates) -> None:
@@ -99,25 +103,28 @@ class MotionFile(TableFile):
         first, self._sample = self._sample, self._sample + len(estimates)
         last = len(self._log.t) - 1
         kept = [k for k in range(first, self._sample) if k % self._stride == 0 or k == last]
-        self.write(
-            [line for k in kept for line in self._lines(k, estimates.kkt.active, (k - first) * len(self._place))]
-        )
+        active = array(estimates.kkt.active).reshape(len(estimates), len(self._robots), -1)
+        self.write_texts(["".join(self._lines(k, active[k - first])) for k in kept])
 
-    def _lines(self, k: int, active: Bool[Tensor, "items m"], place: int) -> Iterator[list[str]]:
-        """The lines of sample k, whose robots come from `place` on in `active`."""
-        log, unknown = self._log, [""] * self._log.x.shape[-1]
-        for j, body in enumerate(log.bodies):
-            if not log.seen[k, j]:
-                continue
-            known = log.u is not None and log.velocity_known[k, j]
-            velocity = [number(v) for v in log.u[k, j]] if known and log.u is not None else unknown
-            position = [number(x) for x in log.x[k, j]]
-            rows: list[int] = []
-            if body in self._place:
-                rows = active[place + self._place[body]].nonzero().flatten().tolist()
-            names = "; ".join([self._labels[row] for row in rows])
-            radius = [] if log.radius is None else [number(float(log.radius[j]))]
-            yield [number(log.t[k]), body, *position, *velocity, *radius, names]
+    def _lines(self, k: int, active: Bool[np.ndarray, "robots m"]) -> Iterator[str]:
+        """The lines of sample k."""
+        log, unknown = self._log, "," * (self._log.x.shape[-1] - 1)
+        t, positions = number(log.t[k]), lines_of(log.x[k])
+        velocities = [unknown] * len(log.bodies) if log.u is None else lines_of(log.u[k])
+        known, names = log.velocity_known[k].tolist(), [""] * len(log.bodies)
+        for j, rows in zip(self._robots, active, strict=True):
+            names[j] = self._named(rows)
+        for j in log.seen[k].nonzero()[0].tolist():
+            velocity = velocities[j] if known[j] else unknown
+            yield ",".join([t, self._names[j], positions[j], velocity, *self._radius[j], names[j]]) + "\r\n"
+
+    def _named(self, active: Bool[np.ndarray, "m"]) -> str:
+        """The cell that names the active rows. They are few, and often the same."""
+        key = active.tobytes()
+        if key not in self._cells:
+            rows = active.nonzero()[0].tolist()
+            self._cells[key] = line_of(["; ".join([self._labels[row] for row in rows])]) if rows else ""
+        return self._cells[key]
 
 
 def _differ(size: tuple[float, float], written: tuple[float, float]) -> bool:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, field
@@ -13,6 +13,8 @@ from pathlib import Path
 from types import MappingProxyType
 
 import torch
+from jaxtyping import Int
+from torch import Tensor
 
 from torchfsid.commands.alternatives import Alternative, best_alternative
 from torchfsid.commands.declared_log import AUTO_FACTOR, DeclaredLog, automatic_bound
@@ -122,7 +124,7 @@ class Observation:
     smallest_bounds: dict[str, float] | None = field(init=False, default=None)
     bound: JudgedBound = field(init=False)
     narrowing: Narrowing | None = field(init=False, default=None)
-    _cases: dict[str, Counter[str]] = field(init=False)
+    _cases: Int[Tensor, "robots cases"] = field(init=False)
 
     def __post_init__(self) -> None:
         if self.config.noise.control == "auto":
@@ -133,7 +135,7 @@ class Observation:
         self.bound = self.declared.judged(self.bound_used)
         if self.config.unknown_numbers:
             self.declared, self.narrowing = narrowed(self.declared)
-        self._cases = {robot: Counter() for robot in self.robots}
+        self._cases = torch.zeros(len(self.robots), len(CASES), dtype=torch.long)
         self.observer = self.config.build_observer(self.declared.task, self.declared.barriers, len(self.robots))
         self.sets = self.observer.sets if isinstance(self.observer, HybridObserver) else self.observer
         if self.narrowing is not None and isinstance(self.sets, SetMembershipObserver):
@@ -238,18 +240,15 @@ class Observation:
             nullcontext() if mcap is None else RunInMcap(mcap, self.declared, results.header, bag) as viewed,
         ):
             for samples, estimates in track(self._estimates()):
-                lines = results.write(samples, estimates)
+                texts = results.write(samples, estimates)
                 sets = of_sets(estimates)
                 motion.see(sets)
                 if viewed is not None:
-                    cells, robots = list(csv.reader(lines)), len(self.robots)
-                    for s, t in enumerate(sets.t.tolist()):
+                    for s, (t, text) in enumerate(zip(sets.t.tolist(), texts, strict=True)):
                         shown = sets.sets.select(sets.which[s])
-                        viewed.see(t, shown, sets.status[s].tolist(), cells[s * robots : (s + 1) * robots])
-                cases = sets.kkt.case.view(sets.which.shape)
-                for i, robot in enumerate(self.robots):
-                    counts = cases[:, i][sets.informative[:, i]].bincount(minlength=len(CASES)).tolist()
-                    self._cases[robot].update(dict(zip(CASES, counts, strict=True)))
+                        viewed.see(t, shown, sets.status[s].tolist(), list(csv.reader(io.StringIO(text, newline=""))))
+                kinds = torch.arange(len(self.robots)).unsqueeze(-1) * len(CASES) + sets.kkt.case.view_as(sets.which).mT
+                self._cases += kinds[sets.informative.mT].bincount(minlength=self._cases.numel()).view_as(self._cases)
             if isinstance(self.sets, SafetyObserver):
                 try:
                     self.sets.look_again(list(self.declared.measurements()))
@@ -298,7 +297,7 @@ class Observation:
         return [
             Verdict(
                 robot=robot,
-                cases={case: self._cases[robot][case] for case in CASES},
+                cases=dict(zip(CASES, self._cases[i].tolist(), strict=True)),
                 skipped=int(self.sets.skipped[i]),
                 infeasible=int(self.sets.infeasible[i]),
                 volume=float(volume[i]),

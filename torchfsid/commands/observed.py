@@ -49,10 +49,10 @@ class Observed:
     observation: Observation
     verdicts: tuple[Verdict, ...]
 
-    def __init__(self, observation: Observation):
+    def __init__(self, observation: Observation, made_from: Mapping[str, str]):
         self.observation, self._folder = observation, TemporaryDirectory(prefix="torchfsid-")
         write_whole(self._out / CONFIG, dump(observation.stated))
-        observation.run(self._out)
+        observation.run(self._out, made_from=made_from)
         if observation.narrowing is not None:
             write_json(self._out / "unknown_numbers.json", observation.narrowing.to_json())
         self.verdicts = tuple(observation.verdicts())

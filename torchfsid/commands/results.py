@@ -32,15 +32,16 @@ from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import NamedTuple
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchfsid.commands.history import SetsFile
 from torchfsid.commands.interruption import uninterrupted
 from torchfsid.commands.results_folder import write_json
 from torchfsid.commands.safety_results import COLUMNS, Distances, SafetyColumns, refutation, safety, without_repeats
-from torchfsid.commands.table_file import TableFile, line_of, lines_of, number
+from torchfsid.commands.table_file import TableFile, line_of, lines_of
 from torchfsid.commands.where_to_look import constraint_name
 from torchfsid.halfspaces import array
 from torchfsid.identification.kkt import CASES
@@ -141,38 +142,58 @@ class ResultsWriter:
     ) -> list[str]:
         """Write one line per robot for the time of the estimate, or for each time of several.
 
-        Returns these lines of estimates.csv.
+        Returns these lines of estimates.csv, a text for each time.
         """
         sets = of_sets(estimate)
         samples, robots = sets.which.shape
-        items, p = samples * robots, self.observer.feasible_set.dim
-        ukf = hybrid = ["," * (p - 1)] * items
+        described = self._described[""](sets)
+        filtered = isinstance(estimate, HybridEstimate | HybridEstimates)
+        if filtered or self._safety is not None or others:
+            first = place = np.arange(samples * robots)
+        else:
+            first, place = _alike(sets, measurement.observed)
+        ends = self._ends(measurement, estimate, others, described, torch.from_numpy(first))
+        lines = [ends[k] for k in place.tolist()]
+        times = enumerate(lines_of(sets.t.unsqueeze(-1)))
+        texts = [t.join(["", *lines[s * robots : (s + 1) * robots]]) for s, t in times]
+        self._estimates.write_texts(texts)
+        for s in sorted({0, *_changes(sets.which), samples - 1}):
+            at = sets.which[s]
+            self._sets.see(
+                float(sets.t[s]), [described[place][:2] for place in at.tolist()], partial(sets.sets.select, at)
+            )
+        return texts
+
+    def _ends(
+        self,
+        measurement: Measurement,
+        estimate: Estimate,
+        others: Mapping[str, SetEstimate],
+        described: Sequence[_Description],
+        items: Int[Tensor, "k"],
+    ) -> list[str]:
+        """The lines of some items, after their times. With safety parameters or `others` these are all items."""
+        sets, blank = of_sets(estimate), "," * (self.observer.feasible_set.dim - 1)
+        ukf = hybrid = [blank] * len(items)
         if isinstance(estimate, HybridEstimate | HybridEstimates):
             filtered = estimate.ukf_estimate if isinstance(estimate, HybridEstimate) else estimate.ukf_estimates
             ukf, hybrid = lines_of(filtered.theta.flatten(0, -2)), lines_of(estimate.theta.flatten(0, -2))
-        observed = measurement.observed
-        measured = [True] * items if observed is None else array(observed).tolist()
-        cases = zip(*(array(of).tolist() for of in (sets.kkt.case, sets.kkt.n_active)), measured, strict=True)
-        active = [f"{CASES[case]},{n}" if seen else "," for case, n, seen in cases]
-        described = self._described[""](sets)
-        names = [STATUS_NAMES[status] for status in array(sets.status.flatten()).tolist()]
+        cases, numbers, which, statuses = (
+            array(of.flatten()[items]).tolist() for of in (sets.kkt.case, sets.kkt.n_active, sets.which, sets.status)
+        )
+        measured = [True] * len(items) if measurement.observed is None else measurement.observed[items].tolist()
+        robots = [self._names[item % len(self.robots)] for item in items.tolist()]
+        active = [f"{CASES[case]},{n}" if seen else "," for case, n, seen in zip(cases, numbers, measured, strict=True)]
+        names = [STATUS_NAMES[status] for status in statuses]
         if self._safety is not None and sets.safety is not None:
             self._seen.see(measurement)
             names = [line_of([*cells, name]) for cells, name in zip(self._safety(sets.safety), names, strict=True)]
         for prefix, other in others.items():
             of_other = zip(names, self._described[prefix](of_sets(other)), other.status.tolist(), strict=True)
             names = [f"{name},{cells.text},{STATUS_NAMES[status]}" for name, cells, status in of_other]
-        heads = [f"{t},{name}" for t in map(number, sets.t.tolist()) for name in self._names]
-        places = (described[place].text for place in array(sets.which.flatten()).tolist())
-        rows = zip(heads, active, places, ukf, hybrid, names, strict=True)
-        lines = [",".join(row) + "\r\n" for row in rows]
-        self._estimates.write_texts("".join(lines[k : k + robots]) for k in range(0, items, robots))
-        for s in sorted({0, *_changes(sets.which), samples - 1}):
-            at = sets.which[s]
-            self._sets.see(
-                float(sets.t[s]), [described[place][:2] for place in at.tolist()], partial(sets.sets.select, at)
-            )
-        return lines
+        texts = [described[place].text for place in which]
+        cells = zip(robots, active, texts, ukf, hybrid, names, strict=True)
+        return [f",{','.join(of_item)}\r\n" for of_item in cells]
 
 
 def of_sets(estimate: Estimate) -> SetEstimates:
@@ -228,6 +249,17 @@ class _Descriptions:
         final = estimates.which[-1]
         self._known, self._last_cut = [found[place] for place in final.tolist()], last_cut[final]
         return found
+
+
+def _alike(sets: SetEstimates, observed: Bool[Tensor, "items"] | None) -> tuple[np.ndarray, np.ndarray]:
+    """Items (time, robot) whose lines differ by the time alone: the first of each kind, and the kind of every item."""
+    kkt, which = sets.kkt, sets.which.flatten()
+    seen = torch.ones_like(which) if observed is None else observed.long()
+    told = [array(of) for of in (which, kkt.case, kkt.n_active, seen, sets.status.flatten())]
+    _, first, kind = np.unique(
+        np.ravel_multi_index(told, [of.max() + 1 for of in told]), return_index=True, return_inverse=True
+    )
+    return first, kind
 
 
 def _changes(which: Int[Tensor, "S B"]) -> list[int]:

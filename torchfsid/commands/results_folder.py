@@ -151,20 +151,27 @@ class ResultsFolder:
                 path.parent.rmdir()
 
 
+@contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """In this block write the yielded file. At its end the file becomes `path`. After an error `path` is as it was."""
+    partial = path.with_name(path.name + ".partial")
+    try:
+        with named(path):
+            yield partial
+            partial.replace(path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
+
+
 def write_whole(path: Path, content: str | bytes) -> None:
     """Write a file whole or not at all.
 
     Raises:
         OSError: it cannot be written. The file at `path` is then unchanged.
     """
-    partial = path.with_name(path.name + ".partial")
-    try:
-        with named(path):
-            partial.write_bytes(content.encode() if isinstance(content, str) else content)
-            partial.replace(path)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
+    with whole(path) as partial:
+        partial.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 def write_json(path: Path, content: object) -> None:

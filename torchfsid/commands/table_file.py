@@ -5,10 +5,11 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import accumulate
 from pathlib import Path
 
+import numpy as np
 from torch import Tensor
 
 from torchfsid.commands.results_folder import named
@@ -42,18 +43,17 @@ class TableFile:
         csv.writer(text).writerows(lines)
         self.write_texts([text.getvalue()])
 
-    def write_texts(self, texts: Iterable[str]) -> None:
+    def write_texts(self, texts: Sequence[str]) -> None:
         """Write texts of whole lines (`line_of`). If writing fails or is interrupted, each is there wholly or not."""
         if self.problem is not None:
             return
-        contents = [text.encode() for text in texts]
-        content, start = b"".join(contents), self._file.tell()
+        content, start = "".join(texts).encode(), self._file.tell()
         try:
             with named(self.path):
                 while content:
                     content = content[self._file.write(content) :]
         except BaseException as error:
-            ends = accumulate(map(len, contents), initial=start)
+            ends = accumulate((len(text.encode()) for text in texts), initial=start)
             written = self._file.tell()
             self._file.truncate(max(end for end in ends if end <= written))
             if not isinstance(error, OSError):
@@ -86,14 +86,15 @@ def line_of(cells: Sequence[str]) -> str:
     return text.getvalue().removesuffix("\r\n")
 
 
-def lines_of(values: Tensor) -> list[str]:
+def lines_of(values: Tensor | np.ndarray) -> list[str]:
     """The numbers (rows, columns) as text, each row as a part of a line."""
-    if not bool(values.isfinite().all()):
-        return [",".join(row) for row in texts(values)]
-    form = ",".join(["%.15g"] * values.shape[-1])
-    return [form % tuple(row) for row in values.numpy(force=True).tolist()]  # torch's own tolist is ten times slower
+    rows = np.asarray(values.numpy(force=True) if isinstance(values, Tensor) else values)
+    if not np.isfinite(rows).all():
+        return [",".join(row) for row in texts(rows)]
+    form = ",".join(["%.15g"] * rows.shape[-1])
+    return [form % tuple(row) for row in rows.tolist()]
 
 
-def texts(values: Tensor) -> list[list[str]]:
+def texts(values: Tensor | np.ndarray) -> list[list[str]]:
     """The numbers (rows, columns) as text."""
     return [[number(value) for value in row] for row in values.tolist()]

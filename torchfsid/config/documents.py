@@ -123,14 +123,17 @@ def apply_overrides(mapping: dict[Any, Any], overrides: Iterable[str]) -> dict[A
         if not equals or not all(keys):
             raise ConfigError(f"override {override!r}: expected path.to.key=value")
         where = f"override {override!r}"
-        mapping = _replaced(mapping, keys, _parse(text, where), where)
+        mapping = with_value(mapping, keys, _parse(text, where), where)
     return mapping
 
 
-def _replaced(node: Any, keys: list[str], value: object, where: str) -> Any:
-    """A copy of `node` with the value at `keys` replaced.
+def with_value(node: Any, keys: list[str], value: object, where: str) -> Any:
+    """A copy of a raw mapping (or of a list within one) with the value at the path `keys` replaced.
 
     Every node on the way is copied, because YAML aliases share nodes that must not change together.
+
+    Raises:
+        ConfigError: the path leads through something that has no keys. The message begins with `where`.
     """
     if not keys:
         return value
@@ -139,10 +142,10 @@ def _replaced(node: Any, keys: list[str], value: object, where: str) -> Any:
         if first not in map(str, range(len(node))):
             raise ConfigError(f"{where}: expected a number below {len(node)} in place of {first!r}")
         i = int(first)
-        return [*node[:i], _replaced(node[i], rest, value, where), *node[i + 1 :]]
+        return [*node[:i], with_value(node[i], rest, value, where), *node[i + 1 :]]
     if node is None or isinstance(node, dict):
         node = node or {}
-        return {**node, first: _replaced(node.get(first), rest, value, where)}
+        return {**node, first: with_value(node.get(first), rest, value, where)}
     raise ConfigError(f"{where}: {reprlib.repr(node)} has no key {first!r}")
 
 

@@ -194,8 +194,8 @@ class UkfConfig(Strict):
         prior_std: standard deviation of theta at the start. Default: that of a uniform distribution over the prior.
         qp_inside: solve the QP inside the filter's dynamics. Otherwise the measurement determines the active rows.
         feedback: the filter goes on from the hybrid observer's projected estimate instead of its own.
-        engine: `filterpy`, or `batch`: the same filter in compiled code. Default: `filterpy`, and `batch` for logs of
-            more than `LONG_LOG` updates where it can be used (`for_log`).
+        engine: `filterpy`, or `batch`: the same filter in compiled code. Default: `filterpy`, and `batch` for sweeps
+            and for logs of more than `LONG_LOG` updates, where it can be used (`for_log`).
     """
 
     position_noise: Positive = 1e-3

@@ -13,9 +13,9 @@ from torch import Tensor
 from torchfsid import device
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, array
+from torchfsid.identification import compiled_in_space
 from torchfsid.identification.kkt import KktSolution
 from torchfsid.kernels import evidence as kernel
-from torchfsid.kernels.evidence_in_space import evidence_in_space
 
 if TYPE_CHECKING:
     from torchfsid.identification.evidence import ObservationModel, Sample
@@ -45,7 +45,7 @@ def can_be_compiled(model: ObservationModel, sample: Sample, wanted: bool | None
     obstacle, in_space, clipped = None, sample.rows.dim == 3, model.task.saturation is not None
     if sample.rows.dim not in (2, 3):
         obstacle = "controls are neither in the plane nor in space"
-    elif clipped and not sample.rows.dim == sample.C.shape[-1] == 2:
+    elif clipped and not in_space and sample.C.shape[-1] != 2:
         obstacle = "the nominal control is clipped, and theta is not planar"
     elif in_space and model.relaxes:
         obstacle = "rows are relaxed, in space"
@@ -61,14 +61,17 @@ def can_be_compiled(model: ObservationModel, sample: Sample, wanted: bool | None
 def _obstacle_on_device(tensors: Sequence[Tensor], rows: Halfspaces) -> str | None:
     if not all(tensor.is_cuda for tensor in tensors):
         return "tensors are neither all on the CPU nor all on CUDA"
-    if rows.dim == 3 or rows.rows == 0:
-        return f"tensors are on CUDA, and {'controls in space' if rows.dim == 3 else 'there are no rows'}"
+    if rows.rows == 0:
+        return "tensors are on CUDA, and there are no rows"
     return device.missing() or None
 
 
 def read(model: ObservationModel, sample: Sample) -> Read:
     """What the kernels say of a sample."""
-    if sample.rows.dim == 2 and sample.rows.rows > 0 and device.has_kernels(sample.rows.A, sample.u):
+    if sample.rows.dim == 3:
+        omega, (informative, alarmed, infeasible, slack, excess), kkt = compiled_in_space.read(model, sample)
+        return omega, (informative, alarmed, infeasible), lambda: (slack, excess, kkt)
+    if sample.rows.rows > 0 and device.has_kernels(sample.rows.A, sample.u):
         return _read_on_device(model, sample)
     angles = sample.u[:, :0] if sample.row_errors is None else sample.row_errors.angle
     rows, relaxed = (sample.rows.A, sample.rows.b, sample.hard), (sample.relaxed,)
@@ -77,14 +80,11 @@ def read(model: ObservationModel, sample: Sample) -> Read:
         torch.atleast_2d(sample.bound), angles, torch.atleast_1d(sample.ball), torch.atleast_1d(sample.drift),
     )  # fmt: skip
     saturation, paper, clip = model.task.saturation, model.kind == "critical_region", NO_CLIP
-    if sample.rows.dim == 3:
-        found = evidence_in_space(*map(array, rows + others), paper, model.active_tolerance)
-    else:
-        if saturation is not None:
-            assert sample.corners is not None
-            limits = np.array(saturation.limits, dtype=np.float64)
-            clip = limits, saturation.shape == "norm", float(saturation.dead_speed), array(sample.corners)
-        found = kernel.evidence(*map(array, rows + relaxed + others), clip, paper, model.active_tolerance)
+    if saturation is not None:
+        assert sample.corners is not None
+        limits = np.array(saturation.limits, dtype=np.float64)
+        clip = limits, saturation.shape == "norm", float(saturation.dead_speed), array(sample.corners)
+    found = kernel.evidence(*map(array, rows + relaxed + others), clip, paper, model.active_tolerance)
     half_spaces, judged, kkt = found
     informative, alarmed, infeasible, slack, excess = map(torch.from_numpy, judged)
     details = slack, excess, KktSolution(*map(torch.from_numpy, kkt))

@@ -17,7 +17,7 @@ of the rows that may be active contains a line. If it contains none, no row of s
 controllers are not exact where it nearly contains one, a violation is then no alarm, either (`RELAXED_OPENING`).
 
 The measurements of a whole log can be concatenated into one batch. In the plane and in space, where no gradient is
-needed, compiled code computes the same from the slacks on (`kernels.evidence`, `kernels.evidence_in_space`).
+needed, compiled code computes the same from the slacks on (`compiled_evidence`, `compiled_in_space`).
 """
 
 from __future__ import annotations
@@ -222,9 +222,9 @@ def evidence(
             not known exactly, and for position errors of tasks with an unknown gain.
         measurement: a measurement of these robots, or several concatenated.
         compiled: whether to run compiled code instead of torch. None chooses compiled code wherever it is possible:
-            controls are in the plane or in space, no gradient is needed, and tensors are on the CPU. Tensors may be on
-            CUDA if controls are in the plane and the extra `cuda` is installed. A nominal control is clipped only if
-            theta is planar, and rows are relaxed only in the plane.
+            controls are in the plane or in space, no gradient is needed, and tensors are on the CPU, or on CUDA if the
+            extra `cuda` is installed. In the plane a nominal control is clipped only if theta is planar. In space no
+            rows are relaxed.
 
     Raises:
         InputError: the measurement has no velocities, they are not finite for an observed robot, the measurement does
@@ -278,7 +278,7 @@ def sample_of(model: ObservationModel, theta: FeasibleSet, measurement: Measurem
     if measurement.observed is not None:
         usable = usable & measurement.observed
     if measurement.left_out is not None:
-        error = u.new_full((), 2 * noise.position)
+        error = u.new_zeros(()) + 2 * noise.position
         if measurement.position_error is not None:
             error = error + measurement.position_error
         usable = usable & left_out_inactive(model.barriers, within_bounds(measurement, noise), largest, error)

@@ -16,7 +16,8 @@ touch the limit, y = uhat, and the half-spaces are those of Q. If all of them ar
 and P is only the arcs in which Q meets the circle. One more normal, between the ends, stands for their chord.
 In a dead zone |y| <= w the control is zero. If Q contains zero, the ball of radius w joins the hull. Every
 approximation gives an outer set. In space the same holds for a box. Of a sphere, Cn and h_P are bounded by the corners
-of Q within the box around it. Compiled code does the same for planar theta (`kernels.saturation`).
+of Q within the box around it. Compiled code does the same (`kernels.saturation`, for planar theta, and
+`kernels.saturation_in_space`).
 """
 
 from __future__ import annotations

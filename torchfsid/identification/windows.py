@@ -153,7 +153,7 @@ class Windows:
     def _moments_of(self, measurement: Measurement, sample: Sample, found: Evidence, robots: int) -> _Moments:
         noise, errors, A, observed = self.model.noise, sample.row_errors, sample.rows.A, measurement.observed
         assert noise is not None
-        rho = torch.full_like(sample.u[:, 0], noise.position)
+        rho = torch.zeros_like(sample.u[:, 0]) + noise.of_samples(robots, len(sample.u)).position
         if measurement.position_error is not None:
             rho = rho + measurement.position_error
         of_items = (

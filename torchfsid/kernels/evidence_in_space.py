@@ -225,6 +225,64 @@ def inverse_optimal(k, m, u, ball, C, d, normals, generator, count, none, row_A,
         row_source[k, n] = 2 * m if generator[n] == none else m + generator[n] % m
 
 
+@item
+@no_type_check
+def is_finite(k, C, d):
+    """Is the nominal control of robot k finite?"""
+    known = True
+    for i in range(3):
+        known = known and math.isfinite(d[k, i])
+        for e in range(C.shape[2]):
+            known = known and math.isfinite(C[k, i, e])
+    return known
+
+
+@item
+@no_type_check
+def read_one(k, rows, sample, bounds, angles, paper, active_tolerance, scratch, half_spaces, judged, kkt):
+    """Fill the places of robot k in the results of `evidence_in_space`, which hold padding and zeros.
+
+    Returns the number of half-spaces.
+    """
+    (A, b, hard), (C, d, u, usable), (bound, ball, drift) = rows, sample, bounds
+    unit, unit_b, near, Y, V, right, a, order, normals, generator = scratch
+    (row_A, row_b, row_source), (informative, alarmed, infeasible, slack, excess) = half_spaces, judged
+    G, f, projector, free, offset, active, n_active, rank, case = kkt
+    known, broken, blind = judge(
+        k, A, b, hard, u, bound, angles, active_tolerance, unit, unit_b, slack, excess, active, near
+    )
+    wish_known = is_finite(k, C, d)
+    usable_here = usable[k] and known and wish_known
+    alarmed[k], informative[k], infeasible[k] = usable_here and broken, usable_here and not broken and not blind, False
+    K, rank[k] = solve_active(k, unit, unit_b, active, Y, V, right, offset, projector)
+    n_active[k], case[k] = K, K if K < 2 else 2 if rank[k] < 2 else 3 if rank[k] == K else 4
+    solve_motion(k, C, d, wish_known, rank[k], offset, projector, free, G, f)
+    if not informative[k]:
+        return 0
+    m, none = len(unit_b), len(order)
+    found = find_generators(k, unit, active[k] if paper else near, angles[:, :0] if paper else angles, a, order)
+    count = normals_in_space(a, order, found, none, normals, generator)
+    if paper:
+        return critical_region(
+            k, unit, unit_b, C, d, G, f, projector, offset, active, normals, generator, count, row_A, row_b, row_source
+        )
+    room = ball[min(k, len(ball) - 1)] + drift[min(k, len(drift) - 1)]
+    inverse_optimal(k, m, u, room, C, d, normals, generator, count, none, row_A, row_b, row_source)
+    return count
+
+
+@item
+@no_type_check
+def rows_for(m, paper):
+    """The largest number of half-spaces that follow from m rows."""
+    return (m if paper else 0) + len(FAN) + EDGES
+
+
+def places(m: int, generators: int) -> list[tuple[tuple[int, ...], type]]:
+    """On a GPU: the shape and the type of a thread's entry in each array of scratch, for m rows."""
+    return [((2 * m + generators, 3), np.float64), ((2 * m,), np.float64), ((generators,), np.int64), ((m,), np.bool_)]
+
+
 @launcher
 @no_type_check
 def evidence_in_space(A, b, hard, C, d, u, usable, bound, angles, ball, drift, paper, active_tolerance):
@@ -233,49 +291,22 @@ def evidence_in_space(A, b, hard, C, d, u, usable, bound, angles, ball, drift, p
     Arguments and results are those of `evidence`, with A (B, m, 3) and C (B, 3, p), without rows that are relaxed and
     without limits on the nominal control.
     """
-    B, m = b.shape
-    p, fan, most = C.shape[2], angles[:, :0] if paper else angles, 1  # a row of padding, where nothing is said
-    generators = m * RING if fan.shape[1] > 0 else m
-    R = (m if paper else 0) + len(FAN) + EDGES
-    row_A, row_b, row_source = np.zeros((B, R, p)), np.ones((B, R)), np.full((B, R), -1)
-    informative, alarmed, infeasible = np.empty(B, np.bool_), np.empty(B, np.bool_), np.zeros(B, np.bool_)
-    slack, excess = np.empty((B, m)), np.empty((B, m))
-    G, f, projector, free = np.zeros((B, 3, p)), np.zeros((B, 3)), np.zeros((B, 3, 3)), np.zeros((B, 3, 3))
-    offset, active = np.zeros((B, 3)), np.empty((B, m), np.bool_)
-    n_active, rank, case = np.empty(B, np.int64), np.empty(B, np.int64), np.empty(B, np.int64)
-    unit, unit_b, near = np.zeros((m, 3)), np.empty(m), np.empty(m, np.bool_)
-    Y, V, right = np.empty((m, 3)), np.empty((3, 3)), np.empty(m)
-    a, order = np.empty((generators, 3)), np.empty(generators, np.int64)
-    normals, generator = np.empty((len(FAN) + EDGES, 3)), np.empty(len(FAN) + EDGES, np.int64)
+    (B, m), p, most = b.shape, C.shape[2], 1  # a row of padding, where nothing is said
+    generators, R = m * RING if angles.shape[1] > 0 and not paper else m, rows_for(m, paper)
+    half_spaces = np.zeros((B, R, p)), np.ones((B, R)), np.full((B, R), -1)
+    judged = np.empty(B, np.bool_), np.empty(B, np.bool_), np.empty(B, np.bool_), np.empty((B, m)), np.empty((B, m))
+    kkt = (
+        np.zeros((B, 3, p)), np.zeros((B, 3)), np.zeros((B, 3, 3)), np.zeros((B, 3, 3)), np.zeros((B, 3)),
+        np.empty((B, m), np.bool_), np.empty(B, np.int64), np.empty(B, np.int64), np.empty(B, np.int64),
+    )  # fmt: skip
+    scratch = (
+        np.zeros((m, 3)), np.empty(m), np.empty(m, np.bool_), np.empty((m, 3)), np.empty((3, 3)), np.empty(m),
+        np.empty((generators, 3)), np.empty(generators, np.int64),
+        np.empty((len(FAN) + EDGES, 3)), np.empty(len(FAN) + EDGES, np.int64),
+    )  # fmt: skip
+    rows, sample, bounds = (A, b, hard), (C, d, u, usable), (bound, ball, drift)
     for k in range(B):
-        known, broken, blind = judge(
-            k, A, b, hard, u, bound, angles, active_tolerance, unit, unit_b, slack, excess, active, near
-        )
-        wish_known = True
-        for i in range(3):
-            wish_known = wish_known and math.isfinite(d[k, i])
-            for e in range(p):
-                wish_known = wish_known and math.isfinite(C[k, i, e])
-        usable_here = usable[k] and known and wish_known
-        alarmed[k], informative[k] = usable_here and broken, usable_here and not broken and not blind
-        K, rank[k] = solve_active(k, unit, unit_b, active, Y, V, right, offset, projector)
-        n_active[k], case[k] = K, K if K < 2 else 2 if rank[k] < 2 else 3 if rank[k] == K else 4
-        solve_motion(k, C, d, wish_known, rank[k], offset, projector, free, G, f)
-        if not informative[k]:
-            continue
-        found = find_generators(k, unit, active[k] if paper else near, fan, a, order)
-        count = normals_in_space(a, order, found, generators, normals, generator)
-        if paper:
-            count = critical_region(
-                k, unit, unit_b, C, d, G, f, projector, offset, active, normals, generator, count,
-                row_A, row_b, row_source,
-            )  # fmt: skip
-        else:
-            room = ball[min(k, len(ball) - 1)] + drift[min(k, len(drift) - 1)]
-            inverse_optimal(k, m, u, room, C, d, normals, generator, count, generators, row_A, row_b, row_source)
+        count = read_one(k, rows, sample, bounds, angles, paper, active_tolerance, scratch, half_spaces, judged, kkt)
         most = max(most, count)
-    return (
-        (row_A[:, :most].copy(), row_b[:, :most].copy(), row_source[:, :most].copy()),
-        (informative, alarmed, infeasible, slack, excess),
-        (G, f, projector, free, offset, active, n_active, rank, case),
-    )
+    row_A, row_b, row_source = half_spaces
+    return (row_A[:, :most].copy(), row_b[:, :most].copy(), row_source[:, :most].copy()), judged, kkt

@@ -1,4 +1,4 @@
-"""The search for the next sample, among many, that cuts a polygon."""
+"""The search for the next sample, among many, that cuts a set: a polygon, or the hull of corners in any dimension."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from torchfsid.kernels.compiled import launcher
 from torchfsid.kernels.polygon import box_of, exceeded
+from torchfsid.tolerances import ROUND_OFF
 
 
 @launcher
@@ -27,6 +28,33 @@ def first_cuts(vertices, count, reach, A, b, start):
                 p, q, c = A[s, k, r, 0], A[s, k, r, 1], b[s, k, r]
                 if exceeded(vertices, k, n, reach_x, reach_y, box, p, q, c)[0] > 0:
                     found[k] = s
+                    break
+            if found[k] < S:
+                break
+    return found
+
+
+@launcher
+@no_type_check
+def first_cuts_of_hulls(corners, reach, A, b, start):
+    """The same for the hulls of corners (B, V, p). A row cuts a hull if it may do so within round-off."""
+    S, B, R = b.shape
+    V, p = corners.shape[1:]
+    found = np.full(B, S)
+    for k in range(B):
+        for s in range(start[k], S):
+            for r in range(R):
+                size, row = abs(b[s, k, r]), A[s, k, r]
+                for i in range(p):
+                    size += abs(row[i]) * reach[k, i]
+                for v in range(V):
+                    beyond = ROUND_OFF * size - b[s, k, r]
+                    for i in range(p):
+                        beyond += row[i] * corners[k, v, i]
+                    if beyond > 0:
+                        found[k] = s
+                        break
+                if found[k] < S:
                     break
             if found[k] < S:
                 break

@@ -12,6 +12,7 @@ far away, f is kept: without it the set would be open. Everything is computed in
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple, no_type_check
 
 import numpy as np
@@ -164,7 +165,7 @@ def _to_frame(lines, f, reach, frame, framed):
         squared += framed[f, i] ** 2
         bound -= lines[f, i] * frame.middle[i]
         size += abs(lines[f, i]) * reach[i]
-    length = squared**0.5
+    length = math.sqrt(squared)
     for i in range(3):
         framed[f, i] /= length
     framed[f, 3], framed[f, 4] = bound / length, ROUND_OFF * size / length

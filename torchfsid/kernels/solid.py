@@ -178,24 +178,47 @@ def measures(points, meets, count, reach):
         set is thicker than round-off (B,), its first axes. Then the volume (B,) and the centroid (B, 3) in the frame.
     """
     (B, V, _), F = points.shape, (points.shape[1] + 4) // 2
-    y, middle, axes, scale = np.zeros((B, V, 3)), np.empty((B, 3)), np.empty((B, 3, 3)), np.empty((B, 3))
-    wide, volume, centre = np.empty(B, np.int64), np.empty(B), np.empty((B, 3))
-    edges, near, at = np.full((F, F), -1), np.empty((V, 3), np.int64), np.empty(F, np.int64)
+    result = (
+        np.zeros((B, V, 3)), np.empty((B, 3)), np.empty((B, 3, 3)), np.empty((B, 3)), np.empty(B, np.int64),
+        np.empty(B), np.empty((B, 3)),
+    )  # fmt: skip
+    graph = graph_of_one(F, V)
     for k in range(B):
-        n = 2 * count[k] - 4
-        link(meets[k], n, edges, near)
-        find_facets(meets[k], n, at)
-        wide[k] = to_axes(points[k], n, reach[k], y[k], middle[k], axes[k], scale[k])
-        volume[k] = volume_of(y[k], meets[k], near, at, wide[k], centre[k])
-        if wide[k] == 1:
-            low = high = y[k, 0, 0]
-            for v in range(n):
-                low, high = min(low, y[k, v, 0]), max(high, y[k, v, 0])
-            centre[k, 0] = (low + high) / 2
-        for v in range(n, V):
-            for j in range(3):
-                y[k, v, j] = y[k, 0, j]
-    return y, middle, axes, scale, wide, volume, centre
+        measure_one(k, points, meets, count, reach, graph, result)
+    return result
+
+
+@launcher
+@no_type_check
+def graph_of_one(F, V):
+    """Scratch for the graph of one polyhedron: edges (all -1), near and at (`simple_polyhedron`)."""
+    return np.full((F, F), -1), np.empty((V, 3), np.int64), np.empty(F, np.int64)
+
+
+def graph_places(F: int, V: int) -> list[tuple[tuple[int, ...], type]]:
+    """On a GPU: the shape and the type of a thread's entry in each of these arrays."""
+    return [((F, F), np.int32), ((V, 3), np.int32), ((F,), np.int32)]
+
+
+@item
+@no_type_check
+def measure_one(k, points, meets, count, reach, graph, result):
+    """Fill the places of polyhedron k in the results of `measures`."""
+    y, middle, axes, scale, wide, volume, centre = result
+    edges, near, at = graph
+    n = 2 * count[k] - 4
+    link(meets[k], n, edges, near)
+    find_facets(meets[k], n, at)
+    wide[k] = to_axes(points[k], n, reach[k], y[k], middle[k], axes[k], scale[k])
+    volume[k] = volume_of(y[k], meets[k], near, at, wide[k], centre[k])
+    if wide[k] == 1:
+        low = high = y[k, 0, 0]
+        for v in range(n):
+            low, high = min(low, y[k, v, 0]), max(high, y[k, v, 0])
+        centre[k, 0] = (low + high) / 2
+    for v in range(n, y.shape[1]):
+        for j in range(3):
+            y[k, v, j] = y[k, 0, j]
 
 
 @launcher
@@ -209,31 +232,41 @@ def skeleton(meets, count, wide, rows):
         independent (B, V).
     """
     (B, V, _), F = meets.shape, rows.shape[1]
-    corners, facet = np.zeros((B, max(4 * F - 12, 0), 3), np.int64), np.zeros((B, max(4 * F - 12, 0)), np.int64)
-    independent = np.zeros((B, V), np.bool_)
-    edges, near, at = np.full((F, F), -1), np.empty((V, 3), np.int64), np.empty(F, np.int64)
-    Q, D, share = np.empty((3, 3)), np.empty(3), np.empty(3)
+    triangles = max(4 * F - 12, 0)
+    result = np.empty((B, triangles, 3), np.int64), np.empty((B, triangles), np.int64), np.empty((B, V), np.bool_)
+    graph, small = graph_of_one(F, V), (np.empty((3, 3)), np.empty(3), np.empty(3))
     for k in range(B):
-        n, new = 2 * count[k] - 4, 0
-        link(meets[k], n, edges, near)
-        find_facets(meets[k], n, at)
-        for f in range(count[k] if wide[k] == 3 else 0):
-            first = at[f]
-            last = along(meets[k], near, first, -1, f)
-            v = along(meets[k], near, last, first, f)
-            while v != first:
-                corners[k, new, 0], corners[k, new, 1], corners[k, new, 2], facet[k, new] = first, last, v, f
-                new += 1
-                v, last = along(meets[k], near, v, last, f), v
-        for v in range(n):
-            independent[k, v] = True
-            for s in range(3):
-                for j in range(3):
-                    Q[s, j] = rows[k, meets[k, v, s], j]
-                squared = orthogonalise(Q[s], Q, D, s, share)
-                D[s] = 1 / squared if squared > 0 else 0.0
-                independent[k, v] &= squared > PARALLEL_ROWS**2
-    return corners, facet, independent
+        skeleton_one(k, meets, count, wide, rows, graph, small, result)
+    return result
+
+
+@item
+@no_type_check
+def skeleton_one(k, meets, count, wide, rows, graph, small, result):
+    """Fill the places of polyhedron k in the results of `skeleton`. `small` are places (3, 3), (3,) and (3,)."""
+    corners, facet, independent = result
+    (edges, near, at), (Q, D, share) = graph, small
+    n, new = 2 * count[k] - 4, 0
+    link(meets[k], n, edges, near)
+    find_facets(meets[k], n, at)
+    for f in range(count[k] if wide[k] == 3 else 0):
+        first = at[f]
+        last = along(meets[k], near, first, -1, f)
+        v = along(meets[k], near, last, first, f)
+        while v != first:
+            corners[k, new, 0], corners[k, new, 1], corners[k, new, 2], facet[k, new] = first, last, v, f
+            new += 1
+            v, last = along(meets[k], near, v, last, f), v
+    for t in range(new, facet.shape[1]):
+        corners[k, t, 0], corners[k, t, 1], corners[k, t, 2], facet[k, t] = 0, 0, 0, 0
+    for v in range(independent.shape[1]):
+        independent[k, v] = v < n
+        for s in range(3 if v < n else 0):
+            for j in range(3):
+                Q[s, j] = rows[k, meets[k, v, s], j]
+            squared = orthogonalise(Q[s], Q, D, s, share)
+            D[s] = 1 / squared if squared > 0 else 0.0
+            independent[k, v] &= squared > PARALLEL_ROWS**2
 
 
 @launcher
@@ -245,22 +278,30 @@ def extreme(meets, vertices, y, rows, direction):
     >= 0, or are nearest to that. `vertices` (B,) is the number of vertices.
     """
     B, D, _ = direction.shape
-    found, along_d = np.zeros((B, D), np.int64), np.empty(y.shape[1])
+    found = np.empty((B, D), np.int64)
     for k in range(B):
         for d in range(D):
-            g, most, size, best = direction[k, d], -np.inf, 0.0, -np.inf
-            for v in range(vertices[k]):
-                along_d[v] = y[k, v, 0] * g[0] + y[k, v, 1] * g[1] + y[k, v, 2] * g[2]
-                most, size = max(most, along_d[v]), max(size, abs(along_d[v]))
-            for v in range(vertices[k]):
-                if along_d[v] < most - TIED * size:
-                    continue
-                p, q, r = rows[k, meets[k, v, 0]], rows[k, meets[k, v, 1]], rows[k, meets[k, v, 2]]
-                det = determinant(p, q, r)
-                weight = -np.inf
-                if abs(det) > PARALLEL_ROWS:
-                    s, t, u = determinant(g, q, r) / det, determinant(p, g, r) / det, determinant(p, q, g) / det
-                    weight = min(s, t, u) / max(abs(s), abs(t), abs(u))
-                if best == -np.inf or weight > best:
-                    found[k, d], best = v, weight
+            found[k, d] = extreme_of(k, meets, vertices[k], y, rows, direction[k, d])
+    return found
+
+
+@item
+@no_type_check
+def extreme_of(k, meets, n, y, rows, g):
+    """The vertex of polyhedron k, of n, that is extreme in the direction g."""
+    most, size, best, found = -np.inf, 0.0, -np.inf, 0
+    for v in range(n):
+        reached = y[k, v, 0] * g[0] + y[k, v, 1] * g[1] + y[k, v, 2] * g[2]
+        most, size = max(most, reached), max(size, abs(reached))
+    for v in range(n):
+        if y[k, v, 0] * g[0] + y[k, v, 1] * g[1] + y[k, v, 2] * g[2] < most - TIED * size:
+            continue
+        p, q, r = rows[k, meets[k, v, 0]], rows[k, meets[k, v, 1]], rows[k, meets[k, v, 2]]
+        det = determinant(p, q, r)
+        weight = -np.inf
+        if abs(det) > PARALLEL_ROWS:
+            s, t, u = determinant(g, q, r) / det, determinant(p, g, r) / det, determinant(p, q, g) / det
+            weight = min(s, t, u) / max(abs(s), abs(t), abs(u))
+        if best == -np.inf or weight > best:
+            found, best = v, weight
     return found

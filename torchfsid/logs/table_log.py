@@ -22,6 +22,7 @@ from torchfsid.logs.log import Log
 from torchfsid.logs.quantities import heading_in, quantities_in, radii_in, repeats_in, times_in
 from torchfsid.logs.reading import UNITS, Reading
 from torchfsid.logs.tables import ParquetTable, Table, require_column
+from torchfsid.logs.units import require_units
 
 
 def read_csv(path: str | Path, heading: str | None = None) -> Log:
@@ -88,7 +89,7 @@ def _log_in(table: Table, heading: str | None) -> Log:
     positions, u, a, turned = (quantities.get(quantity) for quantity in [*UNITS, "heading"])
     assert positions is not None
     seen = by_time_and_body(positions.known)
-    return Log(
+    log = Log(
         source=table.source,
         bodies=bodies,
         t=np.unique(t),
@@ -108,3 +109,5 @@ def _log_in(table: Table, heading: str | None) -> Log:
             rounding={name: of.rounding for name, of in quantities.items() if of.rounding > 0}, duplicates=len(repeats)
         ),
     )
+    require_units(log)
+    return log

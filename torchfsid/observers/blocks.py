@@ -1,9 +1,9 @@
 """Several samples of all robots, taken in at once: what does not depend on Theta is computed for all of them.
 
 The half-spaces of S samples are given. Most of them cut no set. Theta of a robot changes at some samples only, and a
-search finds the next of these for each robot (`kernels.first_cuts`; the support function in other dimensions). All
-robots are then cut together, each by the half-spaces of its own next sample, and the search goes on from there. So sets
-are cut in the order of time, exactly as if the samples had come one by one.
+search finds the next of these for each robot (`kernels.first_cuts`). All robots are then cut together, each by the
+half-spaces of its own next sample, and the search goes on from there. So sets are cut in the order of time, exactly as
+if the samples had come one by one.
 """
 
 from __future__ import annotations
@@ -20,13 +20,11 @@ from torch import Tensor
 from torchfsid.device import any_of
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, array
-from torchfsid.identification.by_robot import by_robot
 from torchfsid.identification.evidence import ObservationModel
-from torchfsid.kernels.first_cuts import first_cuts
+from torchfsid.kernels.first_cuts import first_cuts, first_cuts_of_hulls
 from torchfsid.observers.outliers import Levels, narrowed
 from torchfsid.robots.bounds import ErrorBounds
 from torchfsid.robots.measurement import Measurement
-from torchfsid.sets.around import reach
 from torchfsid.sets.feasible_set import FeasibleSet
 
 LARGEST_THETA = 1e9
@@ -36,15 +34,16 @@ FEW = 12
 """Batches of sets that are joined at a time."""
 
 
-def depends_on_theta(model: ObservationModel, measurement: Measurement) -> bool:
-    """Does what a measurement says depend on the sets so far?
+def depends_on_theta(model: ObservationModel, measurement: Measurement, robots: int) -> bool:
+    """Does what a measurement of these robots says, at one or several times, depend on the sets so far?
 
     A bound on the drift of C theta + d is no smaller for larger theta. If it is the same for theta = 0 as for all theta
     of the largest numbers, it does not depend on theta.
     """
     if model.task.saturation is not None or getattr(model.task, "uncertain", False):
         return True
-    noise = model.noise and replace(model.noise, velocity=0.0, slack=0.0)  # no drift depends on them
+    noise = model.noise and model.noise.of_samples(robots, len(measurement.x))
+    noise = noise and replace(noise, velocity=0.0, slack=0.0)  # no drift depends on them
     errors = ErrorBounds.of(measurement, noise)
     if errors is None:
         return False
@@ -171,14 +170,12 @@ class Course:
         return found
 
     def _next_cut_of(self, level: FeasibleSet, start: Int[Tensor, "B"]) -> Int[Tensor, "B"]:
-        samples, robots = len(self.t), len(start)
+        corners, reach = array(level.body.corners), array(level.body.reach)
         if level.dim == 2:
-            polygons = map(array, (level.body.corners, level.body.count, level.body.reach))
-            return torch.from_numpy(first_cuts(*polygons, *self._rows, array(start))).to(start.device)
-        rows, _ = by_robot(self.omega, 0.0, robots)
-        cuts = (reach(rows, level) > rows.b).unflatten(-1, (samples, -1)).any(-1)
-        cuts = cuts & (torch.arange(samples, device=start.device) >= start.unsqueeze(-1))
-        return torch.where(cuts.any(-1), cuts.int().argmax(-1), samples)
+            found = first_cuts(corners, array(level.body.count), reach, *self._rows, array(start))
+        else:
+            found = first_cuts_of_hulls(corners, reach, *self._rows, array(start))
+        return torch.from_numpy(found).to(start.device)
 
     @cached_property
     def _rows(self) -> tuple[np.ndarray, np.ndarray]:

@@ -239,7 +239,7 @@ class SetMembershipObserver:
             InconsistentError: see `update`. It is raised when all estimates before that sample have been returned.
         """
         robots = len(self.status)
-        if len(samples.x) > robots and not depends_on_theta(self.model, samples.observed_only()):
+        if len(samples.x) > robots and not depends_on_theta(self.model, samples.observed_only(), robots):
             windows = copy(self._windows)
             try:
                 yield self._take_in(samples)

@@ -37,15 +37,18 @@ class Geometry(NamedTuple):
 
     Attributes:
         squared: squared distances r^2 [m^2].
-        r: distances [m].
         gradient: dh/dx, of length 2 r or 1.
         share: dh/dx.u_j, the neighbours' shares; 0 if the rows do not use them.
     """
 
     squared: Float[Tensor, "*batch m"]
-    r: Float[Tensor, "*batch m"]
     gradient: Float[Tensor, "*batch m n"]
     share: Float[Tensor, "*batch m"]
+
+    @property
+    def r(self) -> Float[Tensor, "*batch m"]:
+        """Distances [m]."""
+        return torch.where(self.squared > 0, _root(self.squared), 0.0)
 
 
 class Sight(NamedTuple):
@@ -68,7 +71,12 @@ class Sight(NamedTuple):
 
 @dataclass(frozen=True)
 class ClassK:
-    """alpha(h) = gain sign(h) |h|^power, an extended class-K function. A gain (B, 1) is one for each robot."""
+    """alpha(h) = gain sign(h) |h|^power, an extended class-K function. A gain (B, 1) is one for each robot.
+
+    Raises:
+        InputError: gain or power is not positive. When called: h is not that of B robots, or of several of their
+            samples, concatenated.
+    """
 
     gain: float | Tensor
     power: float = 1.0
@@ -78,7 +86,17 @@ class ClassK:
         require_numbers("class_k.power", "a positive number", self.power, lambda power: power > 0)
 
     def __call__(self, h: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-        return self.gain * (h if self.power == 1 else h.sign() * h.abs() ** self.power)
+        return self._gain_of(h) * (h if self.power == 1 else h.sign() * h.abs() ** self.power)
+
+    def _gain_of(self, h: Tensor) -> float | Tensor:
+        """The gain, repeated for each of several samples of the robots, concatenated."""
+        gain = self.gain
+        if not isinstance(gain, Tensor) or gain.ndim != 2 or gain.shape[-1] != 1 or h.ndim not in (1, 2):
+            return gain
+        if len(h) % len(gain) != 0:
+            raise InputError("class_k.gain", f"one gain, or one for each of {len(h)} robots", tuple(gain.shape))
+        gain = gain.repeat(len(h) // len(gain), 1)
+        return gain if h.ndim == 2 else gain.squeeze(-1)
 
 
 @dataclass(frozen=True)
@@ -123,15 +141,13 @@ class CollisionAvoidance:
         """Distances, gradients of h and the neighbours' shares, which depend on neither gain nor safety distance."""
         away = away_from_bodies(measurement)
         squared = dot(away, away)
-        apart = squared > 0
-        root = torch.where(apart, squared, 1.0).sqrt()
         gradient = 2 * away
         if self.distance == "euclidean":  # at the place of a body itself the direction is unknown: the row is NaN
-            gradient = torch.where(apart.unsqueeze(-1), away / root.unsqueeze(-1), math.nan)
+            gradient = torch.where((squared > 0).unsqueeze(-1), away / _root(squared).unsqueeze(-1), math.nan)
         share = torch.zeros_like(squared)
         if self.neighbour_velocity != "none":
             share = dot(gradient, self._neighbours(measurement))
-        return Geometry(squared, torch.where(apart, root, 0.0), gradient, share)
+        return Geometry(squared, gradient, share)
 
     def errors(self, measurement: Measurement, bounds: ErrorBounds) -> RowErrors:
         """Bounds on the errors of the rows, with r = |dx| known up to e.
@@ -250,3 +266,8 @@ def away_from_bodies(measurement: Measurement) -> Float[Tensor, "*batch m n"]:
     """x - x_j [m]. Slots without a body get a nonzero vector, so that norms and their gradients are finite."""
     present, away = measurement.present, measurement.x.unsqueeze(-2) - measurement.bodies
     return away if all_seen(present) else torch.where(present.unsqueeze(-1), away, 1.0)
+
+
+def _root(squared: Tensor) -> Tensor:
+    """The root, and 1 for 0, so that its gradient is finite."""
+    return torch.where(squared > 0, squared, 1.0).sqrt()

@@ -9,16 +9,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
 from typing import ClassVar, Literal, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchfsid.device import all_seen, constant
+from torchfsid.device import all_seen, constant, on_host
 from torchfsid.errors import InputError
-from torchfsid.halfspaces import Halfspaces
+from torchfsid.halfspaces import Halfspaces, lengths
 from torchfsid.robots.arguments import require_numbers
 from torchfsid.robots.avoidance import ClassK, NeighbourVelocity
 from torchfsid.robots.bounds import ErrorBounds, RowErrors
@@ -124,16 +123,28 @@ def controller_failed(
     slow = measurement.u.norm(dim=-1) <= error
     if all_seen(~slow):
         return slow
-    stopped, sizes = (measurement.u == 0).all(-1), reduce(torch.hypot, rows.A.detach().abs().unbind(-1))
+    stopped, asked = (measurement.u == 0).all(-1), slow.unsqueeze(-1).expand_as(rows.b)
+    if errors is None:
+        asked = asked & (rows.b < 0)  # zero keeps the others
+    sizes = _lengths_where(asked, rows)
     least = torch.zeros_like(rows.b) if errors is None else errors.slack * sizes
     clearly = rows.b < -least - error.unsqueeze(-1) * sizes
-    failed = stopped & (rows.b < least).any(-1) | slow & clearly.any(-1)
+    failed = (asked & (stopped.unsqueeze(-1) & (rows.b < least) | clearly)).any(-1)
     perhaps_joint = any(getattr(barrier, "neighbour_velocity", None) in ("current", None) for barrier in barriers)
     controls = measurement.body_velocities if measurement.body_accelerations is None else measurement.body_accelerations
     if perhaps_joint and controls is not None:
         others_move = (measurement.present & (controls != 0).any(-1)).any(-1)
         failed = failed | (stopped & ~others_move)
     return failed
+
+
+def _lengths_where(asked: Tensor, rows: Halfspaces) -> Tensor:
+    """The lengths of rows where they are asked for. Those of the others are used by nobody."""
+    if not on_host(asked):
+        return lengths(rows.A.detach())
+    found, place = torch.zeros_like(rows.b), asked.nonzero(as_tuple=True)
+    found[place] = lengths(rows.A.detach()[place])
+    return found
 
 
 class _OfNoBody:

@@ -8,8 +8,8 @@ RowErrors     errors of a barrier's rows that follow from errors of positions (`
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import torch
@@ -36,24 +36,24 @@ class NoiseBound:
         neighbour_acceleration: a bound on the errors of other bodies' accelerations, where rows use them [m/s2].
         arrival: a bound on the errors of the robots' own `Measurement.velocity` [m/s].
 
-    `velocity` and `slack` may be tensors (*batch,), a bound for each robot.
+    Each may be a tensor (*batch,), a bound for each robot.
     """
 
     velocity: float | Float[Tensor, "*batch"]
     slack: float | Float[Tensor, "*batch"]
-    position: float
-    neighbour_velocity: float
-    neighbour_acceleration: float
-    arrival: float
+    position: float | Float[Tensor, "*batch"]
+    neighbour_velocity: float | Float[Tensor, "*batch"]
+    neighbour_acceleration: float | Float[Tensor, "*batch"]
+    arrival: float | Float[Tensor, "*batch"]
 
     def __init__(
         self,
         velocity: float | Float[Tensor, "*batch"],
         slack: float | Float[Tensor, "*batch"] | None = None,
-        position: float = 0.0,
-        neighbour_velocity: float = 0.0,
-        neighbour_acceleration: float = 0.0,
-        arrival: float = 0.0,
+        position: float | Float[Tensor, "*batch"] = 0.0,
+        neighbour_velocity: float | Float[Tensor, "*batch"] = 0.0,
+        neighbour_acceleration: float | Float[Tensor, "*batch"] = 0.0,
+        arrival: float | Float[Tensor, "*batch"] = 0.0,
     ):
         slack = velocity if slack is None else slack
         bounds = {"velocity": velocity, "slack": slack, "position": position, "neighbour_velocity": neighbour_velocity}
@@ -68,7 +68,7 @@ class NoiseBound:
         def of_these(bound: float | Tensor) -> float | Tensor:
             return bound[robots] if isinstance(bound, Tensor) and bound.ndim > 0 else bound
 
-        return self._with(of_these(self.velocity), of_these(self.slack))
+        return self._each(of_these)
 
     def of_samples(self, robots: int, items: int) -> NoiseBound:
         """The bounds of all `items` of one or several samples of these robots, concatenated.
@@ -84,12 +84,12 @@ class NoiseBound:
                 raise InputError("noise", f"a bound for each of {robots} robots, or one for all", tuple(bound.shape))
             return bound.repeat(items // max(robots, 1))
 
-        return self._with(repeated(self.velocity), repeated(self.slack))
+        return self._each(repeated)
 
-    def _with(self, velocity: float | Tensor, slack: float | Tensor) -> NoiseBound:
-        if velocity is self.velocity and slack is self.slack:
-            return self
-        return replace(self, velocity=velocity, slack=slack)
+    def _each(self, changed: Callable[[float | Tensor], float | Tensor]) -> NoiseBound:
+        bounds = {field.name: getattr(self, field.name) for field in fields(self)}
+        new = {name: changed(bound) for name, bound in bounds.items() if isinstance(bound, Tensor)}
+        return replace(self, **new) if any(bound is not bounds[name] for name, bound in new.items()) else self
 
 
 class ErrorBounds(NamedTuple):
@@ -119,11 +119,11 @@ class ErrorBounds(NamedTuple):
         added = (
             m.position_error, m.body_position_error, m.body_velocity_error, m.arrival_error, m.body_acceleration_error,
         )  # fmt: skip
-        if not any(declared) and all(error is None for error in added):
+        if all(error is None for error in added) and not any(map(_is_positive, declared)):
             return None
         known = cls.of_controls(measurement, noise)
         position, body_position, body_velocity, velocity, body_acceleration = (
-            bound + size if error is None else bound + size + error
+            bound + _beside(bound, size) if error is None else bound + _beside(bound, size) + error
             for bound, size, error in zip(known[:-1], declared, added, strict=True)
         )
         return cls(position, body_position, body_velocity, velocity, body_acceleration, known.control)
@@ -147,6 +147,15 @@ class ErrorBounds(NamedTuple):
     def exact(self) -> bool:
         """Is all but the controls exact?"""
         return not any(bool((bound > 0).any()) for bound in self[:-1])
+
+
+def _is_positive(bound: float | Tensor) -> bool:
+    return bool((bound > 0).any()) if isinstance(bound, Tensor) else bound > 0
+
+
+def _beside(bounds: Tensor, size: float | Tensor) -> float | Tensor:
+    """A bound for each robot, so that it can be added to `bounds` of robots or of the bodies that they see."""
+    return size.unsqueeze(-1) if isinstance(size, Tensor) and 0 < size.ndim < bounds.ndim else size
 
 
 class RowErrors(NamedTuple):

@@ -94,8 +94,8 @@ class CbfQpController:
     """Follow the task as closely as the barriers allow: `controller(measurement, theta)`.
 
     A barrier may use the neighbours' current controls. If the measurement does not hold them, one QP decides for all
-    robots. The batch is then a team whose robot i is the body in slot i, and the controls of other bodies are zero. One
-    infeasible robot sets the controls of the whole team to zero.
+    robots of a team. The last dimension of the batch is then a team whose robot i is the body in slot i, and the
+    controls of other bodies are zero. One infeasible robot sets the controls of its whole team to zero.
 
     The controller keeps soft barriers like all others. `soft` matters only to observers.
 
@@ -164,14 +164,14 @@ class CbfQpController:
         return Control(u.reshape(*shape, 2), control.nominal, active.reshape(*shape, -1), feasible.reshape(shape))
 
     def _team_control(self, measurement: Measurement, uhat: Tensor) -> Control:
-        """One QP over the stacked controls. It holds the row a.u_i - a.u_j <= b of a pair (i, j) for i and for j."""
+        """One QP for all controls of a team. It holds the row a.u_i - a.u_j <= b of a pair (i, j) for i and for j."""
         if any(hasattr(barrier, "speed_limit") for barrier in self.barriers):
             raise InputError("barriers", "a speed polygon or box instead of a disc, for a joint QP", self.barriers)
-        if uhat.ndim != 2 or uhat.shape != measurement.x.shape:
-            raise InputError("measurement, theta", "one team (robots, n), for a joint QP", tuple(uhat.shape))
-        if bool(measurement.present.diagonal().any()):
+        if uhat.ndim < 2 or uhat.shape != measurement.x.shape:
+            raise InputError("measurement, theta", "teams (*teams, robots, n), for a joint QP", tuple(uhat.shape))
+        if bool(measurement.present.diagonal(dim1=-2, dim2=-1).any()):
             raise InputError("measurement", "robot i to be the body in slot i, for a joint QP", "another order")
-        robots, n = uhat.shape
+        robots, n = uhat.shape[-2:]
         still = replace(measurement, **{neighbours_controls(self.barriers): torch.zeros_like(measurement.bodies)})
         parts = [barrier(still) for barrier in self.barriers]
         own = torch.eye(robots, dtype=torch.float64, device=uhat.device).unsqueeze(1)
@@ -183,14 +183,15 @@ class CbfQpController:
                 pair_columns.append(slice(column, column + robots))
             blocks.append((share.unsqueeze(-1) * part.A.unsqueeze(-2)).flatten(-2))
             column += part.rows
-        rows = torch.cat(blocks, dim=1).flatten(0, 1)
-        joint = Halfspaces(rows, torch.cat([part.b for part in parts], dim=-1).flatten())
-        control = _control(joint, uhat.flatten())
-        active = control.active.reshape(robots, column).clone()
+        rows = torch.cat(blocks, dim=-2).flatten(-3, -2)
+        joint = Halfspaces(rows, torch.cat([part.b for part in parts], dim=-1).flatten(-2))
+        control = _control(joint, uhat.flatten(-2))
+        active = control.active.unflatten(-1, (robots, column)).clone()
         for columns in pair_columns:
-            of_pairs = active[:, columns]
-            active[:, columns] = of_pairs | of_pairs.T
-        return Control(control.u.reshape(robots, n), uhat, active, control.feasible.expand(robots))
+            of_pairs = active[..., columns]
+            active[..., columns] = of_pairs | of_pairs.mT
+        feasible = control.feasible.unsqueeze(-1).expand(uhat.shape[:-1])
+        return Control(control.u.unflatten(-1, (robots, n)), uhat, active, feasible)
 
 
 def _control(safe_controls: Halfspaces, uhat: Tensor) -> Control:

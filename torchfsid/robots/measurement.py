@@ -204,6 +204,14 @@ class Measurement:
             chosen["left_out"] = LeftOut(*(bound[items] for bound in self.left_out))
         return replace(self, **chosen)
 
+    def flattened(self) -> Measurement:
+        """A batch of any shape as one of shape (B,). Nothing is copied unless it has to be."""
+        last = self.x.ndim - 2
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        flat = {name: of.flatten(0, last) for name, of in values.items() if isinstance(of, Tensor) and of.ndim > 0}
+        left_out = None if self.left_out is None else LeftOut(*(bound.flatten(0, last) for bound in self.left_out))
+        return replace(self, **flat, left_out=left_out)
+
     @classmethod
     def concatenate(cls, parts: Sequence[Measurement]) -> Measurement:
         """Several batches as one, one after the other. The time becomes a tensor.

@@ -152,7 +152,7 @@ def within_bounds(measurement: Measurement, noise: NoiseBound) -> Measurement:
     """
     left_out, error = measurement.left_out, measurement.arrival_error
     assert left_out is not None
-    arrival = torch.full_like(measurement.x[..., 0], noise.arrival)
+    arrival = torch.zeros_like(measurement.x[..., 0]) + noise.arrival
     faster = left_out._replace(
         speed=left_out.speed + noise.neighbour_velocity,
         acceleration=left_out.acceleration + noise.neighbour_acceleration,

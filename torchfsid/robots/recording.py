@@ -47,8 +47,8 @@ def write_run(run: Trajectory, path: str | Path, names: Sequence[str] | None = N
         OSError: the file cannot be written.
     """
     path, n = Path(path), run.x.shape[-1]
-    if run.x.ndim != 3:
-        raise InputError("run", "one team (samples, bodies, n)", tuple(run.x.shape))
+    if run.x.ndim != 3 or run.present is not None:
+        raise InputError("run", "one team (samples, bodies, n), all of them present", tuple(run.x.shape))
     if path.suffix.lower() != ".csv":
         raise InputError("path", "a file *.csv", str(path))
     groups = [("", run.x), ("v", run.u)] if run.velocity is None else [("", run.x), ("v", run.velocity), ("a", run.u)]

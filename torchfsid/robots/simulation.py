@@ -112,6 +112,7 @@ class Trajectory:
         feasible: whether the robot's QP had a solution.
         radius: the radii of all bodies [m], if given.
         velocity: the velocities of all bodies at t [m/s], among robots of second order.
+        present: the slots of bodies that are there, see `simulate`. None: all are.
     """
 
     t: Float[Tensor, "samples"]
@@ -122,6 +123,7 @@ class Trajectory:
     feasible: Bool[Tensor, "samples *teams robots"]
     radius: Float[Tensor, "*#teams bodies"] | None = None
     velocity: Float[Tensor, "samples *teams bodies n"] | None = None
+    present: Bool[Tensor, "*#teams bodies"] | None = None
 
     @property
     def robots(self) -> int:
@@ -149,8 +151,29 @@ class Trajectory:
             arrival = torch.zeros_like(self.u[k]) if k == 0 else self.u[k - 1]
         else:
             arrival = self.velocity[k]
-        return _of_teams(
-            float(self.t[k]), self.x[k], arrival, self.u[k], self.robots, self.radius, self.velocity is not None
+        t, second_order = float(self.t[k]), self.velocity is not None
+        return _of_teams(t, self.x[k], arrival, self.u[k], self.robots, self.radius, second_order, self.present)
+
+    def block(self, first: int = 0, last: int | None = None) -> Measurement:
+        """The measurements of samples `first` to `last - 1` as one, batch (samples, *teams, robots)."""
+        part, u = slice(first, last), self.u[slice(first, last)]
+        if self.velocity is None:
+            before = self.u[first - 1 : first] if first > 0 else torch.zeros_like(self.u[:1])
+            arrival = torch.cat([before, u[:-1]])
+        else:
+            arrival = self.velocity[part]
+        t = self.t[part].reshape(-1, *[1] * (u.ndim - 2)).expand(*u.shape[:-2], self.robots)
+        second_order = self.velocity is not None
+        return _of_teams(t, self.x[part], arrival, u, self.robots, self.radius, second_order, self.present)
+
+    def team(self, i: int) -> Trajectory:
+        """The run of one team of a batch (teams,)."""
+        return replace(
+            self,
+            **{name: getattr(self, name)[:, i] for name in ("x", "u", "nominal", "active", "feasible")},
+            radius=self.radius if self.radius is None or self.radius.ndim == 1 else self.radius[i],
+            velocity=None if self.velocity is None else self.velocity[:, i],
+            present=None if self.present is None else self.present[i],
         )
 
     def measurements(self) -> Iterator[Measurement]:
@@ -184,12 +207,13 @@ def simulate(
     velocity: Float[Tensor, "*teams robots n"] | None = None,
     obstacles: Float[Tensor, "*#teams obstacles n"] | None = None,
     radius: Float[Tensor, "*#teams bodies"] | None = None,
+    present: Bool[Tensor, "*#teams bodies"] | None = None,
 ) -> Trajectory:
     """Run a team, or a batch of teams, for `steps` steps. The result has steps + 1 samples, all with controls.
 
     The barriers choose the neighbours' velocities: none, those of one sample ago (zero at the first), or the current
-    ones. Current velocities (of robots of second order: accelerations) need one QP over the team, and one team at a
-    time. A robot whose QP is infeasible has the control zero for that step, and the run goes on.
+    ones. Current velocities (of robots of second order: accelerations) need one QP over the team. A robot whose QP is
+    infeasible has the control zero for that step, and the run goes on.
 
     Args:
         controller: the controller of all robots.
@@ -200,6 +224,8 @@ def simulate(
         velocity: the velocities of robots of second order at the start [m/s]. None: the robots are of first order.
         obstacles: positions of bodies that stand still [m]. Their slots come after the robots'.
         radius: radii of all bodies, robots first [m], for barriers given by a margin.
+        present: the slots that hold a body, for teams of different sizes. Nobody avoids the others, and what they do
+            means nothing. None: all do.
 
     Raises:
         InputError: shapes do not fit, positions are not finite, `dt` or `steps` is not positive.
@@ -218,6 +244,8 @@ def simulate(
         raise InputError("velocity", f"finite velocities {tuple(start.shape)}", velocity)
     if radius is not None and radius.shape[-1:] != (bodies,):
         raise InputError("radius", f"(*teams, {bodies}), robots first, then obstacles", tuple(radius.shape))
+    if present is not None and present.shape[-1:] != (bodies,):
+        raise InputError("present", f"(*teams, {bodies}), robots first, then obstacles", tuple(present.shape))
     if not (dt > 0 and steps > 0):
         raise InputError("dt, steps", "positive", (dt, steps))
     try:
@@ -234,7 +262,7 @@ def simulate(
     def surroundings(t: float, x: Tensor, v: Tensor) -> Measurement:
         x, v = with_obstacles(x, standing), with_obstacles(v, at_rest)
         states.append((x, v))
-        return _of_teams(t, x, v, None, robots, radius, velocity is not None)
+        return _of_teams(t, x, v, None, robots, radius, velocity is not None, present)
 
     samples = list(closed_loop(controller, theta, start, surroundings, dt=dt, samples=steps + 1, velocity=velocity))
     controls = [sample.control for sample in samples]
@@ -247,6 +275,7 @@ def simulate(
         feasible=torch.stack([control.feasible for control in controls]),
         radius=radius,
         velocity=None if velocity is None else torch.stack([v for _, v in states]),
+        present=present,
     )
 
 
@@ -257,11 +286,21 @@ def stands_still(u: Float[Tensor, "*batch n"], nominal: Float[Tensor, "*batch n"
 
 
 def _of_teams(
-    t: float, x: Tensor, v: Tensor, u: Tensor | None, robots: int, radius: Tensor | None, second_order: bool
+    t: float | Tensor,
+    x: Tensor,
+    v: Tensor,
+    u: Tensor | None,
+    robots: int,
+    radius: Tensor | None,
+    second_order: bool,
+    present: Tensor | None,
 ) -> Measurement:
     """`Measurement.of_team` for a batch of teams whose first bodies are the robots, which arrive with velocities v."""
     teams, bodies = x.shape[:-2], x.shape[-2]
     slot = torch.arange(bodies, device=x.device)
+    others = (slot != slot[:robots, None]).expand(*teams, robots, bodies)
+    if present is not None:
+        others = others & present.unsqueeze(-2) & present[..., :robots].unsqueeze(-1)
     radius = None if radius is None else radius.to(torch.float64).expand(*teams, bodies)
 
     def among(of_bodies: Tensor) -> Tensor:
@@ -273,11 +312,12 @@ def _of_teams(
         x=x[..., :robots, :],
         u=None if u is None else u[..., :robots, :],
         bodies=among(x),
-        present=(slot != slot[:robots, None]).expand(*teams, robots, bodies),
+        present=others,
         velocity=v[..., :robots, :],
         body_velocities=among(v) if second_order else controls,
         previous_body_velocities=None if second_order else among(v),
         body_accelerations=controls if second_order else None,
         radius=None if radius is None else radius[..., :robots],
         body_radii=None if radius is None else among(radius),
+        observed=None if present is None else present[..., :robots].expand(*teams, robots),
     )

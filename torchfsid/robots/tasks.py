@@ -57,8 +57,7 @@ class Saturation:
     def __call__(self, y: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
         speed = y.square().sum(-1, keepdim=True).clamp(min=1e-300).sqrt()
         if self.shape == "norm":
-            limit = self.limits[0]
-            clipped = y if math.isinf(limit) else y * (limit / speed).clamp(max=1.0)
+            clipped = y if math.isinf(self.limits[0]) else y * (self.limits[0] / speed).clamp(max=1.0)
         else:
             limits = constant(tuple(self.limits), y.device)
             clipped = y.clamp(-limits, limits)
@@ -130,7 +129,7 @@ class GoalTask:
         uhat = clip(gain (theta - x) - damping v) - loop v
 
     Attributes:
-        gain: the gain.
+        gain: the gain, one number or one for each robot (*batch,).
         dimension: 2 in the plane, 3 in space.
         saturation: how the nominal control is clipped.
         gain_error: a bound on the error of the gain.
@@ -184,10 +183,9 @@ class GoalTask:
         return self.gain_error * (corners - measurement.x.unsqueeze(-2)).norm(dim=-1).amax(-1)
 
     def __call__(self, measurement: Measurement) -> Affine:
-        d = -self.gain * measurement.x
-        if self.damping > 0:
-            d = d - self.damping * _velocity(measurement)
-        return self.gain * _identity_like(measurement.x), d
+        gain = self.gain.unsqueeze(-1) if isinstance(self.gain, Tensor) and self.gain.ndim > 0 else self.gain
+        brake = self.damping * _velocity(measurement) if self.damping > 0 else 0.0
+        return torch.diag_embed(gain * torch.ones_like(measurement.x)), -gain * measurement.x - brake
 
     def drift(self, bounds: ErrorBounds, largest: Tensor) -> Tensor:
         return (self.gain + self.gain_error) * bounds.position + self.damping * bounds.velocity

@@ -46,13 +46,13 @@ class Clipped:
         body: the intersection. Empty items keep the body from before the clip.
         outcome: a `Status` per item.
         shrunk: whether the clip made the item smaller.
-        contradiction: the rows that contradict each other, for empty items.
+        contradiction: the rows that contradict each other, for empty items. None if all outcomes are known to be OK.
     """
 
     body: Any
     outcome: Int[Tensor, "B"]
     shrunk: Bool[Tensor, "B"]
-    contradiction: Contradiction
+    contradiction: Contradiction | None
 
 
 class Body(Protocol):

@@ -155,7 +155,7 @@ class FeasibleSet:
         if halfspaces.dim != p or not given.fits(halfspaces.batch_shape, self.batch_shape):
             expected = f"rows over R^{p} for a batch {tuple(self.batch_shape)}"
             raise InputError("halfspaces", expected, (tuple(halfspaces.A.shape), tuple(halfspaces.b.shape)))
-        waits = p != 2 or not has_kernels(halfspaces.A, halfspaces.b, self.outcome)
+        waits = p not in (2, 3) or not has_kernels(halfspaces.A, halfspaces.b, self.outcome)
         if waits and not finite(halfspaces.A, halfspaces.b):
             raise InputError("halfspaces", "finite rows", "NaN or infinity")
         if m == 0:
@@ -167,14 +167,15 @@ class FeasibleSet:
         stamp = given.stamp(time, self.outcome)
         rows = (halfspaces.A, (m, p)), (halfspaces.b, (m,)), (stamp.expand(*self.batch_shape, m), (m,)), (source, (m,))
         clipped = self.body.clip(*(self._flat(part, shape) for part, shape in rows), self.max_facets)
-        body, decided = clipped.body, waits and not bool(clipped.outcome.any())
+        body, lost, shape = clipped.body, clipped.contradiction, self.batch_shape
+        decided = lost is None or (waits and not bool(clipped.outcome.any()))
         if body is self.body and decided:
             return self
-        shape, outcome, against = self.batch_shape, self.outcome, self.contradiction
-        if not decided:
-            outcome = torch.maximum(outcome, clipped.outcome.reshape(shape))
-            against = against.where(self.is_empty, Facets.of(clipped.contradiction.parts, shape))
         last_cut = torch.where(clipped.shrunk.reshape(shape), stamp.amax(-1), self.last_cut)
+        if lost is None or decided:
+            return replace(self, body=body, last_cut=last_cut).knowing(self.any_empty)
+        outcome = torch.maximum(self.outcome, clipped.outcome.reshape(shape))
+        against = self.contradiction.where(self.is_empty, Facets.of(lost.parts, shape))
         return replace(self, body=body, outcome=outcome, contradiction=against, last_cut=last_cut)
 
     def knowing(self, any_empty: bool) -> FeasibleSet:

@@ -145,14 +145,14 @@ class Polygon:
         parts, outcome, shrunk, entered, against = kernel.clip(
             tuple(map(array, self.fields())), array(A), array(b), array(time), array(source), first, most
         )
-        where = A.device
-        contradiction = Contradiction(*(torch.from_numpy(part).to(where) for part in against))
-        outcomes, smaller = torch.from_numpy(outcome).to(where), torch.from_numpy(shrunk).to(where)
+        back = torch.from_numpy if A.is_cpu else lambda part: torch.from_numpy(part).to(A.device)
+        contradiction = Contradiction(*map(back, against)) if outcome.any() else None
+        outcomes, smaller = back(outcome), back(shrunk)
         if not shrunk.any():
             return Clipped(self, outcomes, smaller, contradiction)
-        body = Polygon(*(torch.from_numpy(part).to(where) for part in parts), sheets=self.sheets)
+        body = Polygon(*map(back, parts), sheets=self.sheets)
         if differentiable:
-            body = body._with_sheet(A, b, torch.from_numpy(entered).to(where))
+            body = body._with_sheet(A, b, back(entered))
         return Clipped(body._pruned(), outcomes, smaller, contradiction)
 
     def _clipped_on_device(self, A: Tensor, b: Tensor, time: Tensor, source: Tensor, most: int, first: int) -> Clipped:

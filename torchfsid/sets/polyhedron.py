@@ -20,9 +20,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchfsid.halfspaces import Halfspaces, array
-from torchfsid.kernels import polyhedron as kernel
-from torchfsid.kernels import solid
+from torchfsid.device import constant
+from torchfsid.halfspaces import Halfspaces
+from torchfsid.sets import compiled_polyhedron as compiled
 from torchfsid.sets import derivatives, recentred, searches
 from torchfsid.sets.body import PRIOR, Clipped, Contradiction
 from torchfsid.sets.derivatives import Skeleton, at
@@ -80,23 +80,23 @@ class Polyhedron:
     @classmethod
     def from_box(cls, lower: Float[Tensor, "B 3"], upper: Float[Tensor, "B 3"]) -> Polyhedron:
         """Axis-parallel boxes. Facets: first the lower sides -z_i <= -lower_i, then the upper sides z_i <= upper_i."""
-        B, device = len(lower), lower.device
-        unit, b = torch.eye(3, dtype=lower.dtype, device=device), torch.cat([-lower, upper], dim=-1)
+        B, where = len(lower), lower.device
+        unit, b = torch.eye(3, dtype=lower.dtype, device=where), torch.cat([-lower, upper], dim=-1)
         A = torch.cat([-unit, unit]).expand(B, 6, 3)
-        is_upper = torch.tensor(list(product([False, True], repeat=3)), device=device)
+        is_upper = constant(tuple(product([False, True], repeat=3)), where, torch.bool)
         label, sheets = torch.zeros_like(b).long(), Sheets()
         if torch.is_grad_enabled() and b.requires_grad:
-            label = 1 + torch.arange(b.numel(), device=device).reshape(b.shape)
+            label = 1 + torch.arange(b.numel(), device=where).reshape(b.shape)
             sheets = sheets.with_sheet(A.flatten(0, 1), b.flatten())
         return cls(
             corners=torch.where(is_upper, upper.unsqueeze(1), lower.unsqueeze(1)).detach(),
-            meets=(torch.arange(3, device=device) + 3 * is_upper).expand(B, 8, 3),
+            meets=(torch.arange(3, device=where) + 3 * is_upper).expand(B, 8, 3),
             A=A,
             b=b.detach(),
             time=torch.full_like(b.detach(), nan),
             source=torch.full_like(label, PRIOR),
             label=label,
-            count=torch.full((B,), 6, device=device),
+            count=torch.full((B,), 6, device=where),
             reach=torch.maximum(lower.abs(), upper.abs()).detach(),
             sheets=sheets,
         )
@@ -144,19 +144,14 @@ class Polyhedron:
         """See `Body.clip`. A facet without which the set would be unbounded is never merged."""
         differentiable = torch.is_grad_enabled() and (A.requires_grad or b.requires_grad)
         first = 1 + self.sheets.rows if differentiable else 0
-        parts, outcome, shrunk, entered, against = kernel.clip(
-            tuple(map(array, self.fields())), array(A), array(b), array(time), array(source), first, most
-        )
-        device = A.device
-        contradiction = Contradiction(*(torch.from_numpy(part).to(device) for part in against))
-        outcomes, smaller = torch.from_numpy(outcome).to(device), torch.from_numpy(shrunk).to(device)
-        if not shrunk.any():
-            return Clipped(self, outcomes, smaller, contradiction)
-        sheets = self.sheets
-        if differentiable:
-            rows = torch.from_numpy(entered).to(device)
-            sheets = sheets.with_sheet(A.flatten(0, 1).index_select(0, rows), b.flatten().index_select(0, rows))
-        return Clipped(self._of(parts, sheets), outcomes, smaller, contradiction)
+        found = compiled.clip(self.fields(), (A, b, time, source), first, most)
+        cut, sheets = self, self.sheets
+        if found.fields is not None:
+            if differentiable:
+                new_A, new_b = (part.index_select(0, found.entered) for part in (A.flatten(0, 1), b.flatten()))
+                sheets = sheets.with_sheet(new_A, new_b)
+            cut = Polyhedron(*found.fields, sheets=sheets)._pruned()
+        return Clipped(cut, found.outcome, found.shrunk, Contradiction(*found.lost))
 
     def merge(self, most: int) -> Polyhedron:
         """Outer polyhedra with at most `most` facets.
@@ -164,7 +159,7 @@ class Polyhedron:
         The facet whose removal adds the least volume is dropped, one by one. A facet without which the set would be
         unbounded is never dropped. So more than `most` may remain.
         """
-        return self._of(kernel.merged(tuple(map(array, self.fields())), most), self.sheets)
+        return Polyhedron(*compiled.merged(self.fields(), most), sheets=self.sheets)._pruned()
 
     # Geometry -------------------------------------------------------------------------------------------------------
 
@@ -219,10 +214,7 @@ class Polyhedron:
 
     @cached_property
     def _numbers(self) -> Measures:
-        fields = map(array, (self.corners, self.meets, self.count, self.reach))
-        y, *frame, wide, volume, centroid = (
-            torch.from_numpy(part).to(self.A.device) for part in solid.measures(*fields)
-        )
+        y, *frame, wide, volume, centroid = compiled.measures(self.corners, self.meets, self.count, self.reach)
         return Measures(y, Frame(*frame), wide, volume, centroid)
 
     @cached_property
@@ -234,8 +226,7 @@ class Polyhedron:
     def _skeleton(self) -> Skeleton:
         """The skeleton in the frame. A flat set has no triangles."""
         known = self._numbers
-        parts = solid.skeleton(*map(array, (self.meets, self.count, known.wide, self._unit_rows)))
-        triangles, facet, solved = (torch.from_numpy(part).to(self.A.device) for part in parts)
+        triangles, facet, solved = compiled.skeleton(self.meets, self.count, known.wide, self._unit_rows)
         return Skeleton(known.y, self.meets, solved, triangles, facet, known.wide == 3)
 
     def _measure(self) -> tuple[Float[Tensor, "B"], Float[Tensor, "B 3"]]:
@@ -266,8 +257,7 @@ class Polyhedron:
         """A vertex extreme in each direction, as a function of its rows. They are an optimal basis: the direction is a
         combination of them with weights >= 0. So the derivatives are right also where more than three facets meet."""
         wanted, _ = self._numbers.frame.rows(direction.detach(), torch.zeros_like(direction[..., 0]))
-        parts = map(array, (self.meets, self.vertex_count, self._numbers.y, self._unit_rows, wanted))
-        return self._solved(torch.from_numpy(solid.extreme(*parts)).to(self.A.device))
+        return self._solved(compiled.extreme(self.meets, self.vertex_count, self._numbers.y, self._unit_rows, wanted))
 
     def _resized(self, slots: int) -> tuple[Tensor, ...]:
         """The fields with slots for `slots` facets."""
@@ -286,7 +276,3 @@ class Polyhedron:
         """This batch without the sheets whose rows are no longer facets."""
         sheets, label = self.sheets.in_use(self.label)
         return self if sheets is self.sheets else replace(self, label=label, sheets=sheets)
-
-    def _of(self, parts: tuple, sheets: Sheets) -> Polyhedron:
-        """The batch of these arrays."""
-        return Polyhedron(*(torch.from_numpy(part).to(self.A.device) for part in parts), sheets=sheets)._pruned()
