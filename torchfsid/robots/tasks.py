@@ -183,7 +183,8 @@ class GoalTask:
 
     def __call__(self, measurement: Measurement) -> Affine:
         require_each("task.gain", self.gain, measurement)
-        gain = torch.ones_like(measurement.x[..., 0]) * for_samples("task.gain", self.gain, measurement.x.shape[:-1])
+        gain, first = for_samples("task.gain", self.gain, measurement.x.shape[:-1]), measurement.x[..., 0]
+        gain = torch.ones_like(first) * gain if isinstance(gain, Tensor) else torch.full_like(first, gain)
         brake = self.damping * _velocity(measurement) if self.damping > 0 else 0.0
         return gain[..., None, None] * _identity_like(measurement.x), -gain.unsqueeze(-1) * measurement.x - brake
 
