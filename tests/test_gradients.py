@@ -221,6 +221,14 @@ def test_critical_region(case: str):
     assert gradgradcheck(region_rows, inputs)
 
 
+def test_forward_derivatives_and_products_with_many_vectors_at_once():
+    scene = paper_case("D", np.random.default_rng(4))
+    A, active, b, C, d = (torch.from_numpy(part) for part in (scene.A, scene.active, scene.b, scene.C, scene.d))
+    A, b = A.requires_grad_(), b.requires_grad_()
+    assert gradcheck(region_rows, (A, b, active, C, d), check_forward_ad=True, check_batched_grad=True, fast_mode=True)
+    assert gradcheck(lambda A, b: clipped_box(A, b).volume(), ragged_rows(), check_batched_grad=True, fast_mode=True)
+
+
 def test_compiled_critical_regions_are_those_of_torch():
     """Of 300 random scenes and all cases in one batch: rows, names, derivatives."""
     rng = np.random.default_rng(8)

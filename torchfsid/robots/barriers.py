@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import ClassVar, Literal, Protocol, runtime_checkable
 
 import torch
@@ -141,7 +142,7 @@ def controller_failed(
 def _lengths_where(asked: Tensor, rows: Halfspaces) -> Tensor:
     """The lengths of rows where they are asked for. Those of the others are used by nobody."""
     if not on_host(asked):
-        return lengths(rows.A.detach())
+        return reduce(torch.hypot, rows.A.detach().abs().unbind(-1))
     found, place = torch.zeros_like(rows.b), asked.nonzero(as_tuple=True)
     found[place] = lengths(rows.A.detach()[place])
     return found
