@@ -98,6 +98,23 @@ def test_the_first_signal_ends_and_later_ones_change_nothing(
     assert signal.getsignal(number) == handler
 
 
+@pytest.mark.parametrize("found", [SystemError, RuntimeError, ZeroDivisionError])
+def test_what_compiled_code_makes_of_a_signal(capsys: pytest.CaptureFixture[str], found: type[Exception]) -> None:
+    """numba's dispatcher raises a SystemError. Another error, of the cleaning up, is not hidden."""
+
+    def action() -> None:
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except KeyboardInterrupt as stop:
+            raise found from stop
+
+    if found is ZeroDivisionError:
+        with pytest.raises(found):
+            execute("prog", action)
+    else:
+        assert answer(capsys, action, None) == (143, "prog: stopped by SIGTERM")
+
+
 def test_what_must_be_finished_is_finished_first(capsys: pytest.CaptureFixture[str]) -> None:
     steps = []
 

@@ -42,7 +42,10 @@ class _Now:
 
 @contextlib.contextmanager
 def interruptible(program: str) -> Iterator[None]:
-    """In this block signals raise `Interrupted`. Those that the process ignores from the start (`nohup`) do not."""
+    """In this block signals raise `Interrupted`. Those that the process ignores from the start (`nohup`) do not.
+
+    What is raised inside numba's compiler or dispatcher comes out as another error, and is raised anew.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -63,9 +66,22 @@ def interruptible(program: str) -> Iterator[None]:
         signal.signal(number, interrupt)
     try:
         yield
+    except Exception as error:
+        if (stop := _behind(error)) is not None:
+            raise stop from None
+        raise
     finally:
         for number in heard:
             signal.signal(number, before[number])
+
+
+def _behind(error: BaseException | None) -> Interrupted | None:
+    """The signal behind an error of numba or of the interpreter. None: there is none, or the error is another one."""
+    if not (isinstance(error, SystemError | RuntimeError) or type(error).__module__.startswith("numba")):
+        return None
+    while error is not None and not isinstance(error, Interrupted):
+        error = error.__cause__ or error.__context__
+    return error
 
 
 @contextlib.contextmanager
