@@ -11,7 +11,7 @@ from typing import no_type_check
 
 import numpy as np
 
-from torchfsid.kernels.compiled import item, launcher
+from torchfsid.kernels.compiled import item, item_in_place, launcher
 from torchfsid.kernels.kkt import solve_one
 from torchfsid.kernels.saturation import ROWS, clipped_inverse_optimal, workspace
 from torchfsid.tolerances import (
@@ -31,7 +31,7 @@ DIRECTIONS, CRITICAL_DIRECTIONS = (
 )
 
 
-@item
+@item_in_place
 @no_type_check
 def is_finite(k, C, d):
     """Is the nominal control of robot k finite?"""
@@ -41,7 +41,7 @@ def is_finite(k, C, d):
     return known
 
 
-@item
+@item_in_place
 @no_type_check
 def judge(k, o, A, b, hard, relaxed, u, bound, angles, active_tolerance, unit, unit_b, slack, excess, active, near):
     """Fill the unit rows, the slacks, the active rows and those that may be active (`near`), at place o of the results.
@@ -79,7 +79,7 @@ def judge(k, o, A, b, hard, relaxed, u, bound, angles, active_tolerance, unit, u
     return known, broken, strained, blind
 
 
-@item
+@item_in_place
 @no_type_check
 def outward_normals(angle, order, K, none, around, normals, generator):
     """Fill the normals of `identification.normals` for K generators given by their angles.
@@ -134,7 +134,7 @@ def outward_normals(angle, order, K, none, around, normals, generator):
     return count, opening if opening > ANGLE_TOLERANCE else 0.0
 
 
-@item
+@item_in_place
 @no_type_check
 def find_generators(k, unit, chosen, angles, angle, order):
     """Fill the angles and names of the chosen rows, each turned by the fractions `SPREAD` of its error.
@@ -153,7 +153,7 @@ def find_generators(k, unit, chosen, angles, angle, order):
     return K
 
 
-@item
+@item_in_place
 @no_type_check
 def critical_region(
     k, o, unit, unit_b, C, d, G, f, P, offset, active, normals, generator, count, row_A, row_b, row_source
@@ -183,7 +183,7 @@ def critical_region(
     return R
 
 
-@item
+@item_in_place
 @no_type_check
 def inverse_optimal(k, m, u, ball, C, d, normals, generator, count, none, row_A, row_b, row_source):
     """The rows of `identification.inverse_optimal_set` that are not padding."""
@@ -196,7 +196,7 @@ def inverse_optimal(k, m, u, ball, C, d, normals, generator, count, none, row_A,
         row_source[k, n] = 2 * m if generator[n] == none else m + generator[n] % m
 
 
-@item
+@item_in_place
 @no_type_check
 def read_one(k, o, rows, sample, angles, fan, around, relaxes, paper, solves, active_tolerance, scratch, judged, kkt):
     """Fill what `evidence` returns of robot k but for half-spaces, and find its normals. Returns their number.

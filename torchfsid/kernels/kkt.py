@@ -14,11 +14,11 @@ from __future__ import annotations
 import math
 from typing import no_type_check
 
-from torchfsid.kernels.compiled import item
+from torchfsid.kernels.compiled import item_in_place
 from torchfsid.tolerances import RANK_TOLERANCE
 
 
-@item
+@item_in_place
 @no_type_check
 def solve_active(o, unit, unit_b, active, offset, projector):
     """Fill A_a^+ b_a and A_a^+ A_a for the active rows. Returns their number K and their rank."""
@@ -61,7 +61,7 @@ def solve_active(o, unit, unit_b, active, offset, projector):
     return K, 1
 
 
-@item
+@item_in_place
 @no_type_check
 def solve_motion(k, o, C, d, wish_known, rank, offset, projector, free, G, f):
     """Fill G and f of u* = G theta + f, and free = I - P, which is exactly zero at full rank, at place o."""
@@ -76,7 +76,7 @@ def solve_motion(k, o, C, d, wish_known, rank, offset, projector, free, G, f):
                 G[o, i, e] = free[o, i, 0] * C[k, 0, e] + free[o, i, 1] * C[k, 1, e]
 
 
-@item
+@item_in_place
 @no_type_check
 def solve_one(k, o, C, d, wish_known, unit, unit_b, kkt):
     """Fill the KKT conditions of robot k, from its unit rows and the active ones, at place o of `kkt`."""
