@@ -261,7 +261,9 @@ class Probing:
         rows, (C, d), u = self.avoidance(informative), self.task(informative), informative.u
         assert u is not None
         if self.kind == "critical_region":
-            return critical_region(rows, active_set(rows, u, self.active_tolerance), C, d)
+            with torch.no_grad():
+                active = active_set(rows, u, self.active_tolerance)
+            return critical_region(rows, active, C, d)
         assert self.noise is not None
         return inverse_optimal_set(rows, u, C, d, self.noise)
 
