@@ -16,17 +16,9 @@ from experiments.sweeps.swept import Swept
 from torchfsid.commands.page.write import run_page, tables_page
 
 
-def scene_page(folder: Path, config: SceneConfig) -> str:
-    """The page of a scene, with the true goals."""
-    return _with_truth(Results(folder, config))
-
-
-def cases_page(folder: Path, config: CasesConfig) -> str:
-    """The page of Table I, with the true goal. The bodies around a robot move with it and are not drawn."""
-    return _with_truth(Results(folder, config))
-
-
-def _with_truth(results: Results) -> str:
+def results_page(folder: Path, config: SceneConfig | CasesConfig) -> str:
+    """The page of a scene or of Table I, with the true goals. Bodies that move with the robot are not drawn."""
+    results = Results(folder, config)
     truth = dict(zip(results.robots, results.goals.tolist(), strict=True))
     outside = results.summary.get("truth_outside", {}).get(results.config.set, {})
     told = {
@@ -34,7 +26,7 @@ def _with_truth(results: Results) -> str:
         for robot in results.robots
         if robot in outside
     }
-    return run_page(results.folder, truth, told)
+    return run_page(folder, truth, told)
 
 
 def sweep_page(folder: Path, config: SweepConfig) -> str:

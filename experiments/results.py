@@ -10,7 +10,7 @@ import csv
 import io
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn, Self
@@ -70,22 +70,22 @@ FILES = {
     "sweep": (
         CONFIG,
         File("records.jsonl", "sweeps.sweep", None, "the journal: a line per run, in the order in which they finished"),
-        File("runs.csv", "sweeps.tables", None, "a row per run (`sweeps.record`)"),
-        File("series.csv", "sweeps.tables", None, "rows per run, time and robot (`sweeps.record`)"),
-        File("runs.parquet", "sweeps.tables", "sweeps.swept", "the same as runs.csv"),
-        File("series.parquet", "sweeps.tables", "sweeps.swept", "the same as series.csv"),
-        File("timings.csv", "sweeps.tables", None, "how long each run took: the one table that is never the same"),
+        File("runs.csv", "sweeps.swept", None, "a row per run (`sweeps.record`)"),
+        File("series.csv", "sweeps.swept", None, "rows per run, time and robot (`sweeps.record`)"),
+        File("runs.parquet", "sweeps.swept", "sweeps.swept", "the same as runs.csv"),
+        File("series.parquet", "sweeps.swept", "sweeps.swept", "the same as series.csv"),
+        File("timings.csv", "sweeps.swept", None, "how long each run took: the one table that is never the same"),
         SUMMARY,
     ),
     "probe_placement": (
         CONFIG,
-        File("runs.csv", "design.placement", "figures.probe", "a row per corridor, number of way-points and method"),
-        File("placements.json", "design.placement", "figures.probe", "per corridor its obstacles, what was chosen"),
-        File("descent.csv", "design.placement", "figures.probe", "first corridor: where Adam's starts went"),
-        File("landscape.csv", "design.placement", "figures.probe", "first corridor: the mean area by place"),
+        File("runs.csv", "design.placement", "figures.placement", "a row per corridor, number of way-points, method"),
+        File("placements.json", "design.placement", "figures.placement", "per corridor its obstacles, what was chosen"),
+        File("descent.csv", "design.placement", "figures.placement", "first corridor: where Adam's starts went"),
+        File("landscape.csv", "design.placement", "figures.placement", "first corridor: the mean area by place"),
         File("replay.json", "design.placement", "figures.placement", "first corridor: one goal, with several probes"),
-        File("switches.csv", "design.placement", "figures.probe", "that goal's area and slope across the corridor"),
-        File("gradient_check.csv", "design.placement", "figures.probe", "gradients against central differences"),
+        File("switches.csv", "design.placement", "figures.placement", "that goal's area and slope across the corridor"),
+        File("gradient_check.csv", "design.placement", "figures.placement", "gradients against central differences"),
         File("no_gradient.csv", "design.placement", None, "shares of placements from which there is no gradient"),
         SUMMARY,
     ),
@@ -238,6 +238,40 @@ class Appender:
         except BaseException:
             self.file.truncate(whole)
             raise
+
+
+class Journal(Appender):
+    """A journal: one line of JSON per finished run, appended and synced in the order of finishing.
+
+    A process that is killed may leave a last line without its end. It is cut off when the journal is opened again. Any
+    other line that is not JSON (a damaged disk) is ignored. In both cases the run is run again. Whole lines are never
+    changed.
+
+    Attributes:
+        records: the records of whole lines, by number of the run.
+    """
+
+    def __init__(self, path: Path):
+        super().__init__(path, keep=True)
+        self.file.seek(0)
+        *lines, rest = self.file.read().split(b"\n")
+        self.file.truncate(self.file.tell() - len(rest))
+        records = filter(None, map(_parse, lines))
+        self.records: dict[int, dict[str, Any]] = {record["run"]: record for record in records}
+
+    def add(self, records: Sequence[dict[str, Any]]) -> None:
+        """Append records. After the return they survive a crash."""
+        self.append("".join(json.dumps(record, allow_nan=False) + "\n" for record in records))
+        os.fsync(self.file.fileno())
+        self.records |= {record["run"]: record for record in records}
+
+
+def _parse(line: bytes) -> dict[str, Any] | None:
+    try:
+        record = json.loads(line)
+    except ValueError:
+        return None
+    return record if isinstance(record, dict) and isinstance(record.get("run"), int) else None
 
 
 def rows_of(columns: Mapping[str, Iterable[Any]]) -> list[dict[str, Any]]:

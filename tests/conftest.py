@@ -20,8 +20,10 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.fixture(autouse=True)
-def checked_anew() -> None:
-    """Types are checked in every test."""
+def checked_anew() -> Iterator[None]:
+    """Types are checked in every test, and in the fixtures that several of them share."""
+    calls.clear()
+    yield
     calls.clear()
 
 

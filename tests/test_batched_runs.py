@@ -14,6 +14,7 @@ from experiments.sweeps.config import SweepConfig
 from experiments.sweeps.sweep import parts, records
 from torchfsid.identification.evidence import ObservationModel, evidence
 from torchfsid.robots.avoidance import ClassK, CollisionAvoidance
+from torchfsid.robots.barriers import Arena, SpeedBox
 from torchfsid.robots.bounds import NoiseBound
 from torchfsid.robots.controller import CbfQpController
 from torchfsid.robots.measurement import Measurement
@@ -150,6 +151,22 @@ def test_teams_of_different_sizes_beside_each_other(neighbours: Any) -> None:
         for field in fields(Measurement):
             if isinstance(value := getattr(last, field.name), torch.Tensor):
                 assert torch.equal(getattr(block, field.name)[-1], value), field.name
+
+
+def test_an_empty_slot_does_not_stop_a_team() -> None:
+    """Empty slots are at zero, where these robots could not keep their walls and their greatest speed, and stand."""
+    avoidance = CollisionAvoidance(ClassK(2.0), safety_distance=0.4, neighbour_velocity="current")
+    walls = Arena((4.0, 4.0), (9.0, 9.0), ClassK(1.0))
+    controller = CbfQpController(GoalTask(1.0), [avoidance, walls, SpeedBox((1.0, 1.0))])
+    start = torch.tensor([[5.0, 5.0], [7.0, 7.0], [0.0, 0.0]], dtype=torch.float64)
+    theta = start[[1, 0, 2]]
+    there = torch.tensor([True, True, False])
+    found = simulate(controller, theta, start, dt=0.1, steps=9, present=there)
+    alone = simulate(controller, theta[:2], start[:2], dt=0.1, steps=9)
+    assert found.feasible[:, :2].all()
+    torch.testing.assert_close(found.x[:, :2], alone.x, rtol=1e-9, atol=1e-12)
+    at_the_wall = simulate(CbfQpController(GoalTask(1.0), [walls]), theta, start, dt=0.5, steps=40, present=there)
+    assert at_the_wall.deadlocked_since.isnan().all()
 
 
 def test_every_bound_may_be_one_for_each_robot() -> None:

@@ -253,6 +253,9 @@ def test_a_bound_for_each_robot() -> None:
             assert_same_sets(fleet.feasible_set, one_by_one.feasible_set)
     with pytest.raises(InputError, match="a bound for each of 4 robots"):
         made(noise=NoiseBound(bounds[:3])).update(samples[0])
+    with pytest.raises(InputError, match="a bound for each of 4 robots"):
+        FleetObserver(made(noise=NoiseBound(bounds[:3])), 2)
+    FleetObserver(made(noise=NoiseBound(bounds[:1])), 2).update(samples[0])
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -271,3 +274,12 @@ def test_a_gain_for_each_robot() -> None:
     for threads in (2, 4):
         with pytest.raises(InputError, match=f"class_k.gain: .* each of {4 // threads} robots"):
             FleetObserver(made(barrier=own), threads).update(samples[0])
+    task = GoalTask(gains.flatten())
+    C, d = task(Measurement.concatenate(samples[:3]))
+    for robot, gain in enumerate(gains.flatten().tolist()):
+        torch.testing.assert_close(C[8 + robot], GoalTask(gain)(samples[2])[0][robot], rtol=0, atol=0)
+        torch.testing.assert_close(d[8 + robot], GoalTask(gain)(samples[2])[1][robot], rtol=0, atol=0)
+    with pytest.raises(InputError, match=r"task.gain: .* each of 4 robots"):
+        GoalTask(gains.flatten()[:3])(samples[0])
+    with pytest.raises(InputError, match=r"class_k.gain: .* each of 4 robots"):
+        made(barrier=replace(own, class_k=ClassK(gains[:2]))).update(samples[0])

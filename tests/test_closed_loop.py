@@ -87,5 +87,6 @@ def test_batches_that_do_not_fit_are_refused():
     with pytest.raises(InputError, match="theta"):
         simulate(controller, goal.expand(2, 1, 2), start, dt=0.1, steps=1)
     joint = [CollisionAvoidance(ClassK(1.0), safety_distance=0.5, neighbour_velocity="current")]
-    with pytest.raises(InputError, match="one team"):
-        simulate(CbfQpController(GoalTask(1.0), joint), goal.expand(2, 1, 2), pair, dt=0.1, steps=1)
+    of_one = Measurement(0.0, start, None, start.expand(1, 1, 2), torch.zeros(1, 1, dtype=torch.bool))
+    with pytest.raises(InputError, match="for a joint QP"):
+        CbfQpController(GoalTask(1.0), joint)(of_one, goal.expand(2, 1, 2))

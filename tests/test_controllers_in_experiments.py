@@ -9,8 +9,8 @@ import torch
 from experiments.__main__ import main
 from experiments.kinds import load
 from experiments.runs.config import SceneConfig
-from experiments.runs.recording import simulate_scene
 from experiments.runs.saved import Results
+from experiments.runs.scene import simulate_scene
 from experiments.sweeps.record import observed
 from tests.test_experiments import CONFIGS, finish
 from torchfsid.logs.table_log import read_csv

@@ -19,7 +19,7 @@ from experiments.design.placement import place
 from experiments.design.probe import Objective, Probing, along, expectation
 from experiments.kinds import load as load_config
 from experiments.results import read_columns
-from experiments.studies.switches import across, summarise_switches
+from experiments.studies.gradients import across, summarise_switches
 from torchfsid.config.documents import dump
 from torchfsid.identification.evidence import SetKind
 from torchfsid.observers.set_membership import SetMembershipObserver

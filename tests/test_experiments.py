@@ -17,8 +17,8 @@ from experiments.__main__ import main
 from experiments.figures.style import length
 from experiments.kinds import KINDS, load
 from experiments.runs.config import SETS, CasesConfig, ExpectedConfig, SceneConfig
-from experiments.runs.recording import simulate_scene
 from experiments.runs.saved import Results
+from experiments.runs.scene import simulate_scene
 from experiments.runs.summary import compare, stays_below, timeline
 from torchfsid.commands.results_folder import write_json
 from torchfsid.config.documents import dump

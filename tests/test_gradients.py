@@ -221,6 +221,14 @@ def test_critical_region(case: str):
     assert gradgradcheck(region_rows, inputs)
 
 
+def test_forward_derivatives_and_products_with_many_vectors_at_once():
+    scene = paper_case("D", np.random.default_rng(4))
+    A, active, b, C, d = (torch.from_numpy(part) for part in (scene.A, scene.active, scene.b, scene.C, scene.d))
+    A, b = A.requires_grad_(), b.requires_grad_()
+    assert gradcheck(region_rows, (A, b, active, C, d), check_forward_ad=True, check_batched_grad=True, fast_mode=True)
+    assert gradcheck(lambda A, b: clipped_box(A, b).volume(), ragged_rows(), check_batched_grad=True, fast_mode=True)
+
+
 def test_compiled_critical_regions_are_those_of_torch():
     """Of 300 random scenes and all cases in one batch: rows, names, derivatives."""
     rng = np.random.default_rng(8)
@@ -239,6 +247,18 @@ def test_compiled_critical_regions_are_those_of_torch():
         found[-1].append(region.source[is_row])
     for ours, theirs in zip(*found, strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
+
+
+def test_padding_is_not_active_whatever_is_said_of_it():
+    """Neither in compiled code, nor in torch's, whose derivatives are differentiated again."""
+    A, b = torch.tensor([[[-1.0, 1.0], [0.0, 0.0]]], dtype=torch.float64), torch.ones(1, 2, dtype=torch.float64)
+    C, d, grads = torch.eye(2, dtype=torch.float64)[None], torch.zeros(1, 2, dtype=torch.float64), []
+    for said, again in ((True, False), (True, True), (False, False)):
+        region = critical_region(Halfspaces(A, b), torch.tensor([[True, said]]), C.requires_grad_(), d)
+        grads += torch.autograd.grad(region.A.square().sum(), C, create_graph=again)
+    assert grads[2].abs().max() > 0
+    torch.testing.assert_close(grads[0], grads[2], rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(grads[1], grads[2], rtol=1e-12, atol=1e-12)
 
 
 def test_critical_region_at_orthogonal_equal_rows():

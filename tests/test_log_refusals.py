@@ -7,7 +7,9 @@ from hypothesis import strategies as st
 
 from tests.test_logs import GAPS
 from torchfsid.errors import LogError
+from torchfsid.logs.log import Log
 from torchfsid.logs.table_log import read_csv
+from torchfsid.logs.units import require_units
 
 repeatable = settings(deadline=None, derandomize=True)
 
@@ -156,3 +158,21 @@ def test_times_in_milliseconds(write, told: str | None) -> None:
         assert len(read_csv(path).t) == 40
     else:
         assert refusal(path).endswith(f"times the ways between positions: {told}?")
+
+
+RIGHT = {
+    "put back a thousand steps away": lambda rng: (0.01, 0.003 * (np.arange(12_000) % 1000), 0.3),
+    "held by a wall": lambda rng: (0.1, rng.normal(0, 5e-5, (40, 3)), 1.0),
+    "slow, with large errors": lambda rng: (1e-3, rng.normal(0, 0.025, (40, 3)), 0.05),
+    "slow, rounded to centimetres": lambda rng: (0.01, np.round(1e-5 * np.arange(12_000), 2), 1e-3),
+}
+
+
+@pytest.mark.parametrize("told", RIGHT)
+def test_units_that_fit(told: str) -> None:
+    """Ways that are a thousand times as long, or as short, as velocities tell, of no wrong unit."""
+    dt, places, speed = RIGHT[told](np.random.default_rng(1))
+    places = places if places.ndim == 2 else np.stack([places, 0 * places], axis=-1)
+    x, there = places[:, None], np.ones((len(places), 1), dtype=np.bool_)
+    u = np.broadcast_to(speed * np.eye(1, x.shape[-1]), x.shape)
+    require_units(Log("a log", ("a",), dt * np.arange(len(x)), x, u, there, there))

@@ -13,7 +13,7 @@ import torch
 
 from experiments.kinds import load
 from experiments.runs.config import SceneConfig
-from experiments.runs.recording import simulate_scene
+from experiments.runs.scene import simulate_scene
 from experiments.sweeps.config import SweepConfig
 from experiments.teams import TeamConfig
 from torchfsid.identification.evidence import ObservationModel, evidence

@@ -195,6 +195,7 @@ def test_a_damaged_file_is_named(
     out = tmp_path / "out"
     shutil.copytree(finished(kind), out)
     whole = (out / name).read_bytes()
+    capsys.readouterr()  # what the run printed
     for what, damage in DAMAGES.items():
         (out / name).write_bytes(damage(whole))
         assert_names(out / name, what, capsys)

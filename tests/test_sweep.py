@@ -22,11 +22,10 @@ from rich.console import Console
 
 from experiments.__main__ import main
 from experiments.kinds import load
+from experiments.results import Journal
 from experiments.sweeps.config import SweepConfig
-from experiments.sweeps.journal import Journal
-from experiments.sweeps.summary import print_sweep, summarise_sweep
 from experiments.sweeps.sweep import run_sweep
-from experiments.sweeps.tables import read_table
+from experiments.sweeps.swept import print_sweep, read_table, summarise_sweep
 from experiments.sweeps.workers import WorkersError, workers
 from torchfsid.commands.results_folder import ResultsFolder
 from torchfsid.config.documents import dump

@@ -176,6 +176,9 @@ def test_rows_hold_for_all_errors_within_their_bounds(form: dict, neighbour: str
     psi = ((share / share.sum(-1, keepdim=True)) @ corners).squeeze(1)
     psi[::2] = corners[::2, 0]
 
+    def speed(w: Tensor) -> Tensor:  # w is a root of it, which magnifies round-off near 0
+        return w.sign() * w.abs() ** unknown.power
+
     def around(bound: float) -> Tensor:
         angle, size = uniform(generator, 0, 6.3, N), uniform(generator, 0, 1, N).clamp(min=0.5) * 2 - 1
         return 0.999999 * bound * size.abs().unsqueeze(-1) * torch.stack([angle.cos(), angle.sin()], dim=-1)
@@ -207,7 +210,8 @@ def test_rows_hold_for_all_errors_within_their_bounds(form: dict, neighbour: str
             over = (rows.low - kept).squeeze(-1)
             assert over[holds].max() <= round_off
             if active:
-                assert (active_w - rows.high).max() <= round_off
+                over_w, over_speed = active_w - rows.high, speed(active_w) - speed(rows.high)
+                assert torch.minimum(over_w, over_speed).max() <= round_off
                 near = velocity + within.errors(seen, errors).slack
                 assert (within(seen).normalised().slack(control) <= near + 1e-12).all()
             elif position == velocity == 0 and (unknown.margin is None or unknown.distance == "euclidean"):

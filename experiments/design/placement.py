@@ -20,8 +20,7 @@ from experiments.design.probe import Probing, along
 from experiments.design.search import METHODS, Evaluated, Search, choose
 from experiments.kinds import Track
 from experiments.results import RowWriter, write_rows
-from experiments.studies.gradient_check import check_gradients, nothing_to_follow
-from experiments.studies.switches import across, summarise_switches
+from experiments.studies.gradients import across, check_gradients, nothing_to_follow, summarise_switches
 from experiments.tables import print_rows
 from torchfsid.commands.results_folder import write_json
 from torchfsid.observers.set_membership import SetMembershipObserver

@@ -18,7 +18,6 @@ from experiments.figures import drawing
 from experiments.figures.film import Film, spread
 from experiments.figures.style import HYBRID, ROBOT, SET_COLOURS, UKF, length, team_colours
 from experiments.runs.config import SceneConfig
-from experiments.runs.lengths import lengths
 from experiments.runs.saved import Results
 
 FRAMES, FRAME_MS, COLOURS = 100, 60, 192
@@ -122,7 +121,7 @@ def _regions(axes: Axes, results: Results, config: SceneConfig) -> Redraw:
 
 def _curves(axes: Axes, results: Results) -> Redraw:
     """Lengths over time. For a team, their geometric means."""
-    measures = lengths(results)
+    measures = results.lengths
     shown = [
         (f"{results.config.set} sqrt_area", "region √area", SET_COLOURS[results.config.set], 1.6, "-"),
         (f"{results.config.set} diameter", "region diameter", SET_COLOURS[results.config.set], 1.0, "--"),

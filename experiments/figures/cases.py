@@ -16,7 +16,6 @@ from experiments.figures.drawing import add_box, add_curves, add_goal, add_regio
 from experiments.figures.style import ACTIVE, INVERSE_OPTIMAL, REGION, ROBOT, SET_COLOURS, UKF
 from experiments.results import reading
 from experiments.runs.config import CasesConfig
-from experiments.runs.lengths import lengths
 from experiments.runs.saved import Region, Results
 
 SHADOW = 20.0
@@ -28,7 +27,7 @@ def draw_cases(folder: Path, config: CasesConfig) -> Iterator[tuple[str, Figure]
     results, count = Results(folder, config), len(config.cases)
     figure = Figure(figsize=(1.62 * count + 0.6, 6.3), layout="constrained")
     axes = figure.subplots(3, count, height_ratios=(1, 1, 0.9))
-    half_way, measures, measured = len(results.t) // 2, lengths(results), _measured(results)
+    half_way, measures, measured = len(results.t) // 2, results.lengths, _measured(results)
     reach = 1.15 * max(np.abs([*region.u, *region.nominal]).max() for region in results.regions[half_way])
     for i, case in enumerate(config.cases):
         _draw_rows(axes[0, i], results.regions[half_way][i], reach)

@@ -25,7 +25,6 @@ from experiments.figures.style import (
     length,
 )
 from experiments.runs.config import SceneConfig
-from experiments.runs.lengths import lengths
 from experiments.runs.saved import Results
 
 ASPECT = 1.25
@@ -104,7 +103,7 @@ def _add_estimates(axes: Axes, results: Results, k: int, origin: np.ndarray) -> 
 
 def _draw_errors(axes: Axes, results: Results, samples: list[int]) -> None:
     """Errors and sizes over time, with the snapshots marked."""
-    drawing.add_curves(axes, results.t, {name: values[:, 0] for name, values in lengths(results).items()})
+    drawing.add_curves(axes, results.t, {name: values[:, 0] for name, values in results.lengths.items()})
     looks = {"ha": "center", "va": "bottom", "fontsize": 7, "color": "0.4"}
     for letter, t in zip(ascii_lowercase, results.t[samples], strict=False):
         axes.axvline(t, color="0.6", lw=0.7, ls=(0, (1, 1.5)), zorder=0)

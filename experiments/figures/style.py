@@ -59,7 +59,7 @@ CURVES: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("ukf", "UKF error", {"color": UKF, "lw": 1.8}),
     ("hybrid", "hybrid error", {"color": HYBRID, "lw": 1.4, "ls": (0, (1, 1))}),
 )
-"""The comparison of sizes and errors: name in `experiments.runs.lengths.lengths`, label, options of matplotlib."""
+"""The comparison of sizes and errors: name in `Results.lengths`, label, options of matplotlib."""
 
 UNITS = ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm"), (1e-9, "nm"))
 

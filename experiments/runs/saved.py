@@ -1,4 +1,8 @@
-"""The results folder of a scene or of constructed cases, read back. This module does not import torch."""
+"""The results folder of a scene or of constructed cases, read back. This module does not import torch.
+
+Sizes of sets and errors of estimates are all lengths. Those of a set are its diameter and the square root of its area,
+in space the cube root of its volume. That of an estimate is its distance to the goal.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +16,14 @@ import numpy as np
 
 from experiments.results import Columns, read_columns, read_json, reading, require_length
 from experiments.runs.config import CasesConfig, ExperimentConfig, SceneConfig
+
+ROOT_NAMES = {2: "sqrt_area", 3: "cbrt_volume"}
+"""Names of the length of a set's volume, by dimension."""
+
+ROOTS = {2: np.sqrt, 3: np.cbrt}
+
+ROUND_OFF = 1e-9
+"""Relative change of a volume that is round-off."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +83,43 @@ class Results:
     def error(self, *columns: str) -> np.ndarray:
         """Distances of point estimates to the goals: (times, robots) [m]."""
         return np.linalg.norm(self.numbers(*columns) - self.goals, axis=-1)
+
+    @cached_property
+    def lengths(self) -> dict[str, np.ndarray]:
+        """All sizes and errors by name: (times, robots) [m]."""
+        n = self.config.dimension
+        measures = {of: self.error(*(f"{of}_{i}" for i in range(n))) for of in ("ukf", "hybrid")}
+        for kind in self.config.sets:
+            measures[f"{kind} {ROOT_NAMES[n]}"] = ROOTS[n](self.of_set(kind, "volume"))
+            measures[f"{kind} diameter"] = self.of_set(kind, "diameter")
+            for point in ("centroid", "centre"):
+                estimate = self.of_set(kind, *(f"{point}_{i}" for i in range(n)))
+                measures[f"{kind} {point}"] = np.linalg.norm(estimate - self.goals, axis=-1)
+        return measures
+
+    @cached_property
+    def prior_lengths(self) -> dict[str, np.ndarray]:
+        """The same lengths before the first measurement: (robots,) [m]."""
+        lower, upper = np.array(self.config.prior.lower), np.array(self.config.prior.upper)
+        distance = np.linalg.norm((lower + upper) / 2 - self.goals, axis=-1)
+        root, diameter = ROOTS[len(lower)](self.prior_volume), np.linalg.norm(upper - lower)
+        before = {"ukf": distance, "hybrid": distance}
+        for kind in self.config.sets:
+            before[f"{kind} {ROOT_NAMES[len(lower)]}"] = np.full_like(distance, root)
+            before[f"{kind} diameter"] = np.full_like(distance, diameter)
+            before |= {f"{kind} centroid": distance, f"{kind} centre": distance}
+        return before
+
+    @property
+    def prior_volume(self) -> float:
+        """The volume of the prior [m^n]."""
+        return float(np.prod(np.array(self.config.prior.upper) - self.config.prior.lower))
+
+    def changes(self, kind: str) -> tuple[np.ndarray, np.ndarray]:
+        """Numbers of samples at which the volume of a set grew, and at which it shrank: (robots,) each."""
+        volumes = np.vstack([np.full(len(self.robots), self.prior_volume), self.of_set(kind, "volume")])
+        before, after = volumes[:-1], volumes[1:]
+        return (after > before * (1 + ROUND_OFF)).sum(0), (after < before * (1 - ROUND_OFF)).sum(0)
 
     def cases(self) -> np.ndarray:
         """Letters of the cases: (times, robots)."""

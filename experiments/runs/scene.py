@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
 from experiments.kinds import Track
 from experiments.results import write_rows
+from experiments.runs.batch import Batch
 from experiments.runs.config import SceneConfig
-from experiments.runs.observe import observe
-from experiments.runs.recording import simulate_scene
+from experiments.runs.errors import measure
+from experiments.runs.observe import Recording, observe
 from experiments.runs.saved import Results
 from experiments.runs.summary import summarise_scene
 from torchfsid.robots.simulation import Trajectory
@@ -21,8 +22,32 @@ def run_scene(config: SceneConfig, out: Path, track: Track) -> dict[str, Any]:
     """Simulate, observe, and return the summary."""
     scene = simulate_scene(config)
     write_trajectory(out / "trajectory.csv", config.bodies, scene.measured)
-    observers, tally = observe(config, scene.recording, out, track)
-    return summarise_scene(config, Results(out, config), observers, tally, scene.true)
+    observed = observe(config, scene.recording, out, track)
+    return summarise_scene(config, Results(out, config), observed, scene.true)
+
+
+class SimulatedScene(NamedTuple):
+    """A scene that was run: its true trajectory, the one measured with errors, and the recording of its robots."""
+
+    true: Trajectory
+    measured: Trajectory
+    recording: Recording
+
+
+def simulate_scene(config: SceneConfig) -> SimulatedScene:
+    """Run the scene's robots from rest in closed loop, and measure them with the configured errors."""
+    batch = Batch([config])
+    model, measured = batch.model(batch.team), measure(batch).team(0)
+    recording = Recording(
+        robots=[robot.name for robot in config.robots],
+        goals=batch.goals,
+        task=model.task,
+        barriers=model.barriers,
+        labels=[label for barrier in model.barriers for label in barrier.labels(config.bodies)],
+        measurements=measured.measurements(),
+        samples=len(measured.t),
+    )
+    return SimulatedScene(batch.true.team(0), measured, recording)
 
 
 def write_trajectory(path: Path, bodies: list[str], measured: Trajectory) -> None:

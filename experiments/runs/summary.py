@@ -10,24 +10,32 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from rich.console import Console
+from rich.markup import escape
 from torch import Tensor
 
 from experiments.runs.config import ExpectedConfig, ExperimentConfig, SceneConfig
-from experiments.runs.lengths import lengths, prior_lengths
-from experiments.runs.observers import Observers
+from experiments.runs.observe import Observed
 from experiments.runs.saved import Results
-from experiments.runs.tally import Tally
+from experiments.tables import table
 from torchfsid.robots.simulation import Trajectory
 
 SHARES = (0.1, 0.01)
 
+ESTIMATORS = {"ukf": "UKF error", "hybrid": "hybrid error"} | {
+    f"{kind} {measure}": f"{name} {measure.replace('sqrt_', '√').replace('cbrt_', '∛')}"
+    for kind, name in (("critical_region", "paper's region"), ("inverse_optimal", "inverse-optimal"))
+    for measure in ("sqrt_area", "cbrt_volume", "diameter", "centroid", "centre")
+}
 
-def summarise_scene(
-    config: SceneConfig, results: Results, observers: Observers, tally: Tally, true: Trajectory
-) -> dict[str, Any]:
+LONGEST = 10
+"""Intervals of a timeline that are printed."""
+
+
+def summarise_scene(config: SceneConfig, results: Results, observed: Observed, true: Trajectory) -> dict[str, Any]:
     """The content of summary.json."""
     active = {robot: [at[i].active for at in results.regions] for i, robot in enumerate(results.robots)}
-    measures, before = lengths(results), prior_lengths(results)
+    measures, before = results.lengths, results.prior_lengths
 
     def per_robot(values: list | np.ndarray | Tensor) -> dict[str, Any]:
         return dict(zip(results.robots, values if isinstance(values, list) else values.tolist(), strict=True))
@@ -45,10 +53,10 @@ def summarise_scene(
     if config.expected:
         summary["expected_timeline"] = compare(results.t, active[results.robots[0]], config.expected, config.dt)
     return summary | {
-        "steps": tally.samples,
-        "truth_outside": {kind: per_robot(of.outside) for kind, of in tally.sets.items()},
-        "area_grew": {kind: per_robot(of.grew) for kind, of in tally.sets.items()},
-        "ukf_outside": {kind: per_robot(of.ukf_outside) for kind, of in tally.sets.items()},
+        "steps": len(results.t),
+        "truth_outside": {kind: per_robot(outside) for kind, outside in observed.outside.items()},
+        "area_grew": {kind: per_robot(results.changes(kind)[0]) for kind in config.sets},
+        "ukf_outside": {kind: per_robot(outside) for kind, outside in observed.ukf_outside.items()},
         "before": {name: per_robot(values) for name, values in before.items()},
         "at_snapshots": [
             {"t": float(results.t[k]), **{name: per_robot(values[k]) for name, values in measures.items()}}
@@ -58,7 +66,7 @@ def summarise_scene(
             f"{share:.0%}": {name: per_robot(until_below(name, share)) for name in measures} for share in SHARES
         },
         "infeasible_steps": per_robot((~true.feasible).sum(0)),
-        "relaxed_samples": per_robot(observers.sets[config.set].infeasible),
+        "relaxed_samples": per_robot(observed.observers.sets[config.set].infeasible),
         "deadlocked_since": per_robot([None if math.isnan(t) else t for t in true.deadlocked_since.tolist()]),
     }
 
@@ -120,3 +128,44 @@ def compare(
 
 def _agrees(names: list[str], expected: ExpectedConfig) -> bool:
     return len(names) == expected.count if expected.active is None else set(names) == set(expected.active)
+
+
+def print_verdict(summary: dict[str, Any], console: Console) -> None:
+    """Print the summary of a scene."""
+    for robot, intervals in summary["timeline"].items():
+        more = [f"{len(intervals) - LONGEST} more in summary.json"] if len(intervals) > LONGEST else []
+        told = "; ".join([*map(_interval, intervals[:LONGEST]), *more])
+        console.print(escape(f"{robot}: {told}"), highlight=False)
+    if "expected_timeline" in summary:
+        console.print(f"Farthest from the expected timeline: {summary['expected_timeline']['deviation']:.3g} s")
+    console.print(f"{summary['steps']} steps per robot, of which")
+    for counted, promise in (("truth_outside", "the truth was outside"), ("area_grew", "the area grew")):
+        counts = ", ".join(f"{sum(of.values())} ({kind})" for kind, of in summary[counted].items())
+        console.print(f"  {promise}: {counts}", highlight=False)
+    console.print("From when on lengths are below 10 % / 1 % of the prior's \\[s]:")
+    robots = list(summary["timeline"])
+    shown = table([""], [escape(robot) for robot in robots])
+    for name, label in ((name, ESTIMATORS[name]) for name in ESTIMATORS if name in summary["before"]):
+        of_shares = [summary["time_below"][share][name] for share in ("10%", "1%")]
+        shown.add_row(label, *(" / ".join(_time(of[robot]) for of in of_shares) for robot in robots))
+    relaxed = summary["relaxed_samples"]
+    if any(relaxed.values()):
+        shown.add_section()
+        shown.add_row("samples whose rows may be relaxed", *(str(relaxed[robot]) for robot in robots))
+    console.print(shown)
+    for robot in robots:
+        if summary["infeasible_steps"][robot] and not relaxed[robot]:
+            console.print(
+                f"[red]{escape(robot)}: {summary['infeasible_steps'][robot]} steps without a feasible control"
+            )
+        if summary["deadlocked_since"][robot] is not None:
+            console.print(f"[red]{escape(robot)}: in deadlock since {summary['deadlocked_since'][robot]:.2f} s")
+
+
+def _interval(interval: dict[str, Any]) -> str:
+    active = ", ".join(interval["active"]) or "none"
+    return active if interval["until"] is None else f"{active} until {interval['until']:.2f} s"
+
+
+def _time(t: float | None) -> str:
+    return "never" if t is None else f"{t:.2f}"

@@ -24,7 +24,7 @@ from torch import Tensor
 from experiments.kinds import Track
 from experiments.results import RowWriter
 from experiments.runs.errors import in_disc
-from experiments.runs.observers import build_sets
+from experiments.runs.observe import build_sets
 from experiments.runs.swarm_config import SwarmConfig
 from torchfsid.commands.results import STATUS_NAMES, ResultsWriter
 from torchfsid.identification.kkt import CASES

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from itertools import product
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -105,15 +106,10 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    print(
-        "| errors | rows | dropouts | lost | flagged | differences: median (largest) | windows | ratio | 0.5 s used |"
-    )
-    print("|---|---|---|---:|---:|---:|---:|---:|---:|")
-    cases: list[tuple[Errors, bool, bool]] = [
-        (errors, joint, dropouts)
-        for errors in ("disc", "Gauss") for joint in (True, False) for dropouts in (False, True)
-    ]  # fmt: skip
-    for errors, joint, dropouts in cases:
+    heads = "errors | rows | dropouts | lost | flagged | differences: median (largest) | windows | ratio | 0.5 s used"
+    print(f"| {heads} |\n|---|---|---|---:|---:|---:|---:|---:|---:|")
+    kinds: tuple[Errors, ...] = ("disc", "Gauss")
+    for errors, joint, dropouts in product(kinds, (True, False), (False, True)):
         found = [run(seed, errors, joint, dropouts) for seed in range(options.seeds)]
         both = [result for team in found for result in team.values()]
         far, near = (1e3 * np.array([d for team in found for d in team[way].diameters]) for way in WAYS)

@@ -24,11 +24,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from experiments.figures.safety_parameters import draw_study
-from experiments.results import write_rows
-from experiments.studies.safety_summary import TARGET, as_markdown, tables
+from experiments.results import Journal, write_rows
+from experiments.studies.safety_summary import TARGET, as_markdown, draw_study, tables
 from experiments.studies.safety_teams import Form, Prior, Setting, Team, draw, logged
-from experiments.sweeps.journal import Journal
 from experiments.sweeps.workers import workers
 from torchfsid.commands.results_folder import write_json
 from torchfsid.commands.terminal import track

@@ -151,39 +151,21 @@ def simulated(kind: str, seed: int) -> Team:
     return Team(run, goals, task)
 
 
-@dataclass(frozen=True)
-class Ending:
-    """How the robots of one team end.
+def ending(belief: Belief, team: Team) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Observe a team with the barrier of the belief.
 
-    Attributes:
-        flagged: whether the status is not `ok`.
-        inside: whether the truth is in the set.
-        diameter: of the final sets, relative to 2 BOUND/GAIN.
-        relaxed: share of the samples that are not used because the rows may have been infeasible.
-        unused: share of the samples that are not used.
+    Returns:
+        For each robot whether its status is not `ok`, whether the truth is in its set, and the diameter of this set
+        relative to 2 BOUND/GAIN. Then two shares of the samples: those that are not used because the rows may have been
+        infeasible, and all that are not used.
     """
-
-    flagged: Tensor
-    inside: Tensor
-    diameter: Tensor
-    relaxed: float
-    unused: float
-
-
-def ending(belief: Belief, team: Team) -> Ending:
-    """Observe a team with the barrier of the belief."""
     observer = SetMembershipObserver(belief.task, belief.barriers, team.prior, noise=NoiseBound(BOUND))
     relaxed = 0
     for sample in team.run.measurements():
         relaxed += int(observer.update(belief.seen(sample)).evidence.infeasible.sum())
-    samples = len(team.run.t) * len(team.goals)
-    return Ending(
-        observer.status != Status.OK,
-        observer.feasible_set.contains(team.goals),
-        observer.feasible_set.diameter() / (2 * BOUND / belief.task.gain),
-        relaxed / samples,
-        int(observer.skipped.sum()) / samples,
-    )
+    theta, not_used = observer.feasible_set, torch.tensor([relaxed, int(observer.skipped.sum())])
+    diameter, shares = theta.diameter() / (2 * BOUND / belief.task.gain), not_used / (len(team.run.t) * len(team.goals))
+    return observer.status != Status.OK, theta.contains(team.goals), diameter, shares
 
 
 def judged(belief: Belief, team: Team) -> JudgedBound:
@@ -208,11 +190,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(f"| {' | '.join(heads)} |\n|{'---|' * len(heads)}")
     for belief in BELIEFS:
         of_run = teams[belief.run]
-        ends = [ending(belief, team) for team in of_run]
+        *of_robots, shares = zip(*(ending(belief, team) for team in of_run), strict=True)
+        flagged, inside, diameter = map(torch.cat, of_robots)
         interacts = torch.cat([team.interacts for team in of_run])
-        flagged, inside = torch.cat([end.flagged for end in ends]), torch.cat([end.inside for end in ends])
-        free = torch.cat([team.gets_free for team in of_run]) & ~flagged
-        widths = torch.cat([end.diameter for end in ends])[free]
+        widths = diameter[torch.cat([team.gets_free for team in of_run]) & ~flagged]
         cells = [
             belief.name,
             f"{len(flagged)}",
@@ -220,8 +201,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f"{int((flagged & interacts).sum())}",
             f"{int((flagged & ~interacts).sum())}",
             f"{int((~flagged & ~inside).sum())}",
-            f"{sum(end.relaxed for end in ends) / len(ends):.1%}",
-            f"{sum(end.unused for end in ends) / len(ends):.1%}",
+            *(f"{share:.1%}" for share in torch.stack(shares).mean(0).tolist()),
             f"{float(widths.median()):.3g}, {float(widths.max()):.3g}" if len(widths) else "",
         ]
         if chosen.auto:

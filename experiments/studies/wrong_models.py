@@ -101,29 +101,6 @@ BELIEFS = (
 )
 
 
-@dataclass(frozen=True)
-class Ending:
-    """How the robots of all runs end.
-
-    Attributes:
-        flagged: robots whose status is not `ok`.
-        right: robots with status `ok` and the truth in the set.
-        silent: robots with status `ok` and the truth outside.
-        away: largest distance of the truth from such a set [m].
-        delay: longest time for which a status was `ok` with the truth outside [s].
-        strained: robots that end `ok` and need more than half of the bound.
-        strained_silent: silent robots among the strained ones.
-    """
-
-    flagged: int
-    right: int
-    silent: int
-    away: float
-    delay: float
-    strained: int
-    strained_silent: int
-
-
 def simulated(task: Task, seeds: int) -> tuple[Trajectory, Tensor]:
     """One team per seed, and the goals of all robots [m]."""
     circles, goals = [], []
@@ -156,8 +133,14 @@ def directions(angle: Tensor) -> Tensor:
     return torch.stack([angle.cos(), angle.sin()], dim=-1)
 
 
-def ending(belief: Belief, samples: list[Measurement], goals: Tensor, noise: NoiseBound) -> Ending:
-    """Observe all runs with the model of the belief."""
+def ending(belief: Belief, samples: list[Measurement], goals: Tensor, noise: NoiseBound) -> list[str]:
+    """Observe all runs with the model of the belief. How many robots end how, as cells of the table.
+
+    `flagged`: the status is not `ok`. `ok, inside`, `ok, outside`: it is `ok` and the truth is in the set, or outside
+    of it. `strained`: it is `ok` and needs more than half of the bound, and how many of these are silent. `away`: the
+    largest distance of a truth outside from its set [m]. `silent for`: the longest time for which a status was `ok`
+    with the truth outside [s].
+    """
     observer = SetMembershipObserver(belief.task, belief.barriers, prior(goals), noise=noise)
     has_truth = isinstance(belief.task, GoalTask)
     steps = torch.zeros(len(goals))
@@ -169,15 +152,10 @@ def ending(belief: Belief, samples: list[Measurement], goals: Tensor, noise: Noi
     away = torch.where(silent, (observer.feasible_set.project(goals) - goals).norm(dim=-1), 0.0)
     consistency = Consistency(samples, belief.task, belief.barriers, prior(goals), others=noise)
     relaxed = consistency.sets(torch.as_tensor(noise.velocity).expand(len(goals)) / 2).fits
-    return Ending(
-        flagged=int((~ok).sum()),
-        right=int((ok & ~silent).sum()),
-        silent=int(silent.sum()),
-        away=float(away.max()),
-        delay=DT * float(steps.max()),
-        strained=int((ok & ~relaxed).sum()),
-        strained_silent=int((silent & ~relaxed).sum()),
-    )
+    counted = (~ok, ok & ~silent, silent, ok & ~relaxed, silent & ~relaxed)
+    flagged, right, outside, strained, strained_silent = (str(int(robots.sum())) for robots in counted)
+    farthest = f"{float(away.max()):.2g}" if silent.any() else ""
+    return [flagged, right, outside, f"{strained} ({strained_silent})", farthest, f"{DT * float(steps.max()):.3g}"]
 
 
 def prior(goals: Tensor) -> FeasibleSet:
@@ -231,11 +209,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if chosen.auto:
                 declared = automatic(belief, samples, goals, bound)
                 label = f"{float(torch.as_tensor(declared.velocity).median()):.2g}"
-            found = ending(belief, samples, goals, declared)
-            counts = f"{found.flagged} | {found.right} | {found.silent} | {found.strained} ({found.strained_silent})"
-            away = f"{found.away:.2g}" if found.silent else ""
-            last = f"{found.delay:.3g} | {useless(samples, declared)}" if chosen.auto else f"{found.delay:.3g}"
-            print(f"| {belief.name} | {label} | {errors:g} | {counts} | {away} | {last} |", flush=True)
+            cells = [belief.name, label, f"{errors:g}", *ending(belief, samples, goals, declared)]
+            cells += [str(useless(samples, declared))] if chosen.auto else []
+            print(f"| {' | '.join(cells)} |", flush=True)
     return 0
 
 

@@ -22,7 +22,7 @@ from experiments.results import rows_of
 from experiments.runs.batch import Batch, Model
 from experiments.runs.config import SceneConfig
 from experiments.runs.errors import measure
-from experiments.runs.observers import Observers
+from experiments.runs.observe import Observers
 from torchfsid.commands.observe import BLOCK_ROWS
 from torchfsid.commands.results import STATUS_NAMES
 from torchfsid.identification.active_set import active_set

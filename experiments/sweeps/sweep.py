@@ -14,13 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from experiments.kinds import Track
+from experiments.results import Journal
 from experiments.runs.batch import likeness
 from experiments.runs.config import SceneConfig
 from experiments.sweeps.config import SweepConfig
-from experiments.sweeps.journal import Journal
 from experiments.sweeps.record import most_alike, observed
-from experiments.sweeps.summary import summarise_sweep
-from experiments.sweeps.tables import write_tables
+from experiments.sweeps.swept import summarise_sweep, write_tables
 from experiments.sweeps.workers import Workers, workers
 from torchfsid.errors import FsidError, one_line
 

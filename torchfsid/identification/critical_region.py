@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from torchfsid.device import on_host
 from torchfsid.halfspaces import Halfspaces, array, dot
@@ -44,7 +45,7 @@ def critical_region(
     C, d, m = C.to(torch.float64), d.to(torch.float64), safe_controls.rows
     require_fit(safe_controls, active, C, d)
     tensors = safe_controls.A, safe_controls.b, active, C, d
-    if m == 0 or safe_controls.dim != 2 or not on_host(*tensors) or torch._C._are_functorch_transforms_active():
+    if m == 0 or safe_controls.dim != 2 or not on_host(*tensors) or _transformed():
         return _in_torch(*tensors)
     inner = 2, 1, 1, 2, 1
     batch = np.broadcast_shapes(*(t.shape[:-n] for t, n in zip(tensors, inner, strict=True)))
@@ -53,8 +54,13 @@ def critical_region(
     return Halfspaces(A, b, source)
 
 
+def _transformed() -> bool:
+    """Is there a transform of torch (vmap, jvp) or a forward derivative?"""
+    return torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0
+
+
 def _in_torch(A: Tensor, b: Tensor, active: Tensor, C: Tensor, d: Tensor) -> Halfspaces:
-    unit = Halfspaces(A, b).normalised()
+    unit, active = Halfspaces(A, b).normalised(), active & (A != 0).any(-1)  # zero rows are never active
     return region_of(unit, solve_unit(unit, active, C, d), C, d)
 
 
@@ -70,15 +76,18 @@ class _Region(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad_A: Tensor, grad_b: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
-        tensors = ctx.saved_tensors
-        if not torch.is_grad_enabled():
+        tensors, again = ctx.saved_tensors, torch.is_grad_enabled()
+        many = map(torch._C._functorch.is_legacy_batchedtensor, (grad_A, grad_b))  # type: ignore[attr-defined]
+        if not (again or any(many)):
             found = regions.critical_regions_vjp(*map(array, (*tensors, grad_A, grad_b)))
             of_A, of_b, of_C, of_d = map(torch.from_numpy, found)
             return of_A, of_b, None, of_C, of_d
-        region = _in_torch(*tensors)  # second derivatives are wanted
+        # Second derivatives are wanted, or the products with many vectors at once (`is_grads_batched`).
         leaves = [tensor for tensor in tensors if tensor.requires_grad]
+        with torch.enable_grad():
+            region = _in_torch(*tensors)
         found = torch.autograd.grad(
-            (region.A, region.b), leaves, (grad_A, grad_b), create_graph=True, materialize_grads=True
+            (region.A, region.b), leaves, (grad_A, grad_b), create_graph=again, materialize_grads=True
         )
         grads = iter(found)
         return tuple(next(grads) if tensor.requires_grad else None for tensor in tensors)

@@ -146,7 +146,7 @@ class Windows:
             return found
         of_windows = read_sample(self.model, windows, compiled)
         says = of_windows.informative.unflatten(0, (len(self.lengths), -1))
-        self.used, self.ended = self.used + says.sum(1), self.ended + whole.flatten(1).sum(1)
+        self.used, self.ended = self.used + says.sum(1).cpu(), self.ended + whole.flatten(1).sum(1).cpu()
         omega, _ = by_robot(of_windows.omega, 0.0, len(measurement.x))
         return replace(found, omega=Halfspaces.stack([found.omega, omega]), informative=found.informative | says.any(0))
 

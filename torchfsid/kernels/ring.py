@@ -91,12 +91,14 @@ def _move(ring, edge, source, target, count):
 @item
 @no_type_check
 def keep_arc(ring, edge, n, line, p, q, c, inner, slack):
-    """Keep the arc around the vertex `inner` with (p, q).v - c <= slack, closed along the line. Some vertex is beyond.
+    """Keep the arc around the vertex `inner` with (p, q).v - c <= slack, closed along the line.
 
     Returns its vertex count.
     """
     first, within_first, beyond_first = _last_kept(ring, n, p, q, c, slack, inner, False)
     last, within_last, beyond_last = _last_kept(ring, n, p, q, c, slack, inner, True)
+    if not (beyond_first > slack and beyond_last > slack):  # a GPU may round the same product in several ways
+        return n
     x0 = y0 = x1 = y1 = 0.0
     enters, leaves, incoming = within_first < -slack, within_last < -slack, edge[before_in(first, n)]
     if leaves:

@@ -128,7 +128,8 @@ class FleetObserver:
 
 
 def _part(observer: SetMembershipObserver, robots: Int[Tensor, "k"]) -> SetMembershipObserver:
-    noise = None if observer.noise is None else observer.noise.select(robots)
+    fleet = len(observer.status)
+    noise = None if observer.noise is None else observer.noise.of_samples(fleet, fleet).select(robots)
     return replace(observer, feasible_set=observer.feasible_set.select(robots), noise=noise)
 
 

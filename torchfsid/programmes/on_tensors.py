@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchfsid import device
+from torchfsid.halfspaces import array
 from torchfsid.outcome import Status
 from torchfsid.programmes import exact
 
@@ -84,7 +85,7 @@ def _verified(of: Callable, given: tuple[Tensor, ...], found: tuple[Tensor, ...]
     """The results, with the items that are UNSOLVED replaced by those of the same function of `exact`."""
     lost = (found[-1] == Status.UNSOLVED).nonzero().squeeze(-1)
     if len(lost) > 0:
-        again = _quiet(of, *(tensor[lost].numpy(force=True) for tensor in given))
+        again = _quiet(of, *(array(tensor[lost]) for tensor in given))
         for part, solved in zip(found, again, strict=True):
             part[lost] = torch.from_numpy(solved).to(part.device)
     return found

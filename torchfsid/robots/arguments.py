@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from torchfsid.errors import InputError
+
+if TYPE_CHECKING:
+    from torchfsid.robots.measurement import Measurement
 
 
 def require_numbers(name: str, expected: str, value: Any, fits: Callable[[Tensor], Tensor | bool]) -> None:
@@ -23,6 +26,32 @@ def require_numbers(name: str, expected: str, value: Any, fits: Callable[[Tensor
         is_right = False
     if not is_right:
         raise InputError(name, expected, repr(value))
+
+
+def for_samples(name: str, value: float | Tensor, batch: torch.Size) -> float | Tensor:
+    """A number for each of B robots, repeated for each of several of their samples, concatenated.
+
+    Raises:
+        InputError: the batch is not one of samples of B robots.
+    """
+    if not isinstance(value, Tensor) or value.ndim != 1 or len(batch) != 1:
+        return value
+    if len(value) == 0 or batch[0] % len(value) != 0:
+        raise InputError(name, f"one number, or one for each of {batch[0]} robots", tuple(value.shape))
+    return value.repeat(batch[0] // len(value))
+
+
+def require_each(name: str, value: float | Tensor, measurement: Measurement) -> None:
+    """Check that numbers for robots (B, ...) are those of all robots of one sample. Two samples of half of them are
+    only known by their times.
+
+    Raises:
+        InputError: the sample is one of another number of robots.
+    """
+    robots = len(measurement.x)
+    is_one = measurement.x.ndim == 2 and not isinstance(measurement.t, Tensor)
+    if is_one and isinstance(value, Tensor) and value.ndim > 0 and len(value) not in (1, robots):
+        raise InputError(name, f"one number, or one for each of {robots} robots", tuple(value.shape))
 
 
 def require_names(name: str, names: Any) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ from torch import Tensor
 from torchfsid.device import all_seen
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, dot
-from torchfsid.robots.arguments import require_choice, require_numbers
+from torchfsid.robots.arguments import for_samples, require_choice, require_each, require_numbers
 from torchfsid.robots.bounds import ErrorBounds, RowErrors
 from torchfsid.robots.measurement import Measurement
 from torchfsid.tolerances import ROUND_OFF
@@ -89,14 +89,11 @@ class ClassK:
         return self._gain_of(h) * (h if self.power == 1 else h.sign() * h.abs() ** self.power)
 
     def _gain_of(self, h: Tensor) -> float | Tensor:
-        """The gain, repeated for each of several samples of the robots, concatenated."""
         gain = self.gain
         if not isinstance(gain, Tensor) or gain.ndim != 2 or gain.shape[-1] != 1 or h.ndim not in (1, 2):
             return gain
-        if len(h) % len(gain) != 0:
-            raise InputError("class_k.gain", f"one gain, or one for each of {len(h)} robots", tuple(gain.shape))
-        gain = gain.repeat(len(h) // len(gain), 1)
-        return gain if h.ndim == 2 else gain.squeeze(-1)
+        of_items = for_samples("class_k.gain", gain.squeeze(-1), h.shape[:1])
+        return of_items.unsqueeze(-1) if isinstance(of_items, Tensor) and h.ndim == 2 else of_items
 
 
 @dataclass(frozen=True)
@@ -125,6 +122,7 @@ class CollisionAvoidance:
         require_choice("neighbour_velocity", self.neighbour_velocity, get_args(NeighbourVelocity))
 
     def __call__(self, measurement: Measurement) -> Halfspaces:
+        require_each("class_k.gain", self.class_k.gain, measurement)
         Ds = distance_kept(self.safety_distance, self.margin, measurement.radius, measurement.body_radii)
         if self.distance == "squared":  # the most frequent one needs no distances
             away = away_from_bodies(measurement)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import ClassVar, Literal, Protocol, runtime_checkable
 
 import torch
@@ -18,7 +19,7 @@ from torch import Tensor
 from torchfsid.device import all_seen, constant, on_host
 from torchfsid.errors import InputError
 from torchfsid.halfspaces import Halfspaces, lengths
-from torchfsid.robots.arguments import require_numbers
+from torchfsid.robots.arguments import require_each, require_numbers
 from torchfsid.robots.avoidance import ClassK, NeighbourVelocity
 from torchfsid.robots.bounds import ErrorBounds, RowErrors
 from torchfsid.robots.measurement import Measurement
@@ -141,7 +142,7 @@ def controller_failed(
 def _lengths_where(asked: Tensor, rows: Halfspaces) -> Tensor:
     """The lengths of rows where they are asked for. Those of the others are used by nobody."""
     if not on_host(asked):
-        return lengths(rows.A.detach())
+        return reduce(torch.hypot, rows.A.detach().abs().unbind(-1))
     found, place = torch.zeros_like(rows.b), asked.nonzero(as_tuple=True)
     found[place] = lengths(rows.A.detach()[place])
     return found
@@ -227,6 +228,7 @@ class Arena(_OfNoBody):
             raise InputError("arena", "lower < upper on every axis [m]", (self.lower, self.upper))
 
     def __call__(self, measurement: Measurement) -> Halfspaces:
+        require_each("class_k.gain", self.class_k.gain, measurement)
         h = self._distances(measurement.x)
         identity = torch.eye(len(self.lower), dtype=torch.float64, device=h.device)
         return Halfspaces(torch.cat([identity, -identity]).expand(*h.shape, len(self.lower)), self.class_k(h))

@@ -66,7 +66,7 @@ class NoiseBound:
         """The bounds of some robots."""
 
         def of_these(bound: float | Tensor) -> float | Tensor:
-            return bound[robots] if isinstance(bound, Tensor) and bound.ndim > 0 else bound
+            return bound[robots] if isinstance(bound, Tensor) and bound.ndim > 0 and len(bound) > 1 else bound
 
         return self._each(of_these)
 

@@ -185,6 +185,8 @@ class CbfQpController:
             column += part.rows
         rows = torch.cat(blocks, dim=-2).flatten(-3, -2)
         joint = Halfspaces(rows, torch.cat([part.b for part in parts], dim=-1).flatten(-2))
+        if measurement.observed is not None:  # an empty slot must not stop the team
+            joint = joint.where(measurement.observed.repeat_interleave(column, dim=-1))
         control = _control(joint, uhat.flatten(-2))
         active = control.active.unflatten(-1, (robots, column)).clone()
         for columns in pair_columns:

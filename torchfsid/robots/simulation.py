@@ -134,13 +134,15 @@ class Trajectory:
     def deadlocked_since(self) -> Float[Tensor, "*teams robots"]:
         """The time from which a robot stands still until the end although its nominal control is not zero [s].
 
-        It is NaN for a robot that is not deadlocked. A robot stopped by an infeasible QP counts as deadlocked;
-        `feasible` tells the two apart.
+        It is NaN for a robot that is not deadlocked, and for an empty slot. A robot stopped by an infeasible QP counts
+        as deadlocked; `feasible` tells the two apart.
         """
         with torch.no_grad():
             stuck = stands_still(self.u[..., : self.robots, :], self.nominal)
             if self.velocity is not None:
                 stuck = stuck & (self.velocity[..., : self.robots, :].norm(dim=-1) <= AT_REST)
+            if self.present is not None:
+                stuck = stuck & self.present[..., : self.robots]
             until_the_end = stuck.flip(0).long().cumprod(0).sum(0)
             since = self.t[(len(self.t) - until_the_end).clamp(max=len(self.t) - 1)]
             return torch.where(until_the_end > 0, since, torch.nan)

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from torchfsid.device import constant
 from torchfsid.errors import InputError
-from torchfsid.robots.arguments import require_names, require_numbers
+from torchfsid.robots.arguments import for_samples, require_each, require_names, require_numbers
 from torchfsid.robots.bounds import ErrorBounds
 from torchfsid.robots.measurement import Measurement
 
@@ -79,8 +79,7 @@ class Task(Protocol):
         feedback(measurement)               (*batch, n), or None.
         feedback_error(bounds)              (*batch): a bound on its error.
 
-    `parameter_names` holds the names of the p entries of theta. `task(measurement)` returns C (*batch, n, p) and
-    d (*batch, n).
+    `parameter_names` names the p entries of theta. `task(measurement)` returns C (*batch, n, p) and d (*batch, n).
     """
 
     @property
@@ -129,7 +128,7 @@ class GoalTask:
         uhat = clip(gain (theta - x) - damping v) - loop v
 
     Attributes:
-        gain: the gain, one number or one for each robot (*batch,).
+        gain: the gain, one number or one for each robot (*batch,), also of several samples.
         dimension: 2 in the plane, 3 in space.
         saturation: how the nominal control is clipped.
         gain_error: a bound on the error of the gain.
@@ -183,12 +182,14 @@ class GoalTask:
         return self.gain_error * (corners - measurement.x.unsqueeze(-2)).norm(dim=-1).amax(-1)
 
     def __call__(self, measurement: Measurement) -> Affine:
-        gain = self.gain.unsqueeze(-1) if isinstance(self.gain, Tensor) and self.gain.ndim > 0 else self.gain
+        require_each("task.gain", self.gain, measurement)
+        gain = torch.ones_like(measurement.x[..., 0]) * for_samples("task.gain", self.gain, measurement.x.shape[:-1])
         brake = self.damping * _velocity(measurement) if self.damping > 0 else 0.0
-        return torch.diag_embed(gain * torch.ones_like(measurement.x)), -gain * measurement.x - brake
+        return gain[..., None, None] * _identity_like(measurement.x), -gain.unsqueeze(-1) * measurement.x - brake
 
     def drift(self, bounds: ErrorBounds, largest: Tensor) -> Tensor:
-        return (self.gain + self.gain_error) * bounds.position + self.damping * bounds.velocity
+        gain = for_samples("task.gain", self.gain, bounds.position.shape) + self.gain_error
+        return gain * bounds.position + self.damping * bounds.velocity
 
     def feedback(self, measurement: Measurement) -> Float[Tensor, "*batch n"] | None:
         return -self.loop * _velocity(measurement) if self.loop > 0 else None

@@ -93,12 +93,13 @@ class _Attached(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad_A: Tensor, grad_b: Tensor) -> tuple[Tensor | None, ...]:
-        label, rows = ctx.saved_tensors[0].flatten(), 1 + sum(ctx.lengths)
+        label, lengths = ctx.saved_tensors[0].flatten(), [1, *ctx.lengths]
         parts = (
-            part.new_zeros(rows, *part.shape[2:]).index_add(0, label, part.flatten(0, 1)).split([1, *ctx.lengths])[1:]
+            part.new_zeros(sum(lengths), *part.shape[2:]).index_add(0, label, part.reshape(len(label), *part.shape[2:]))
             for part in (grad_A, grad_b)
         )
-        return None, None, None, *(grad for pair in zip(*parts, strict=True) for grad in pair)
+        pairs = zip(*(part.split(lengths)[1:] for part in parts), strict=True)
+        return None, None, None, *(grad for pair in pairs for grad in pair)
 
 
 def carried(sets: Any, facets: tuple[Int[Tensor, "N"], Int[Tensor, "N"]], rows: Halfspaces) -> Any:
