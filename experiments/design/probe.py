@@ -43,6 +43,7 @@ from torch import Tensor
 
 from experiments.design.runs import Runs, run
 from torchfsid.halfspaces import Halfspaces
+from torchfsid.identification.active_set import active_set
 from torchfsid.identification.critical_region import critical_region
 from torchfsid.identification.evidence import ObservationModel, SetKind, evidence
 from torchfsid.identification.inverse_optimal import inverse_optimal_set
@@ -250,17 +251,19 @@ class Probing:
             x, u = (part.flatten(0, 1).index_select(0, sample) for part in runs.along(path))
             probe = path.flatten(0, 1).index_select(0, sample // (T * len(goals)) * T + sample % T)
             bodies = torch.cat([again.bodies[:, :-1], probe.unsqueeze(1)], dim=1)
-            told = self._omega(replace(again, x=x, u=u, bodies=bodies), found.kkt.active[sample])
+            told = self._omega(replace(again, x=x, u=u, bodies=bodies))
             theta = carried(theta, (item, slot), told.select(of_facet))
         area = torch.where(sound, theta.volume(), self.prior_area)
         return Left(area.reshape(-1, len(goals)), sound.reshape(-1, len(goals)))
 
-    def _omega(self, informative: Measurement, active: Bool[Tensor, "B m"]) -> Halfspaces:
-        """The half-spaces of `evidence`, given the rows that were found to be active."""
+    def _omega(self, informative: Measurement) -> Halfspaces:
+        """The half-spaces of `evidence`, with gradients."""
         rows, (C, d), u = self.avoidance(informative), self.task(informative), informative.u
-        if self.kind == "critical_region":
-            return critical_region(rows, active, C, d)
         assert u is not None
+        if self.kind == "critical_region":
+            with torch.no_grad():
+                active = active_set(rows, u, self.active_tolerance)
+            return critical_region(rows, active, C, d)
         assert self.noise is not None
         return inverse_optimal_set(rows, u, C, d, self.noise)
 

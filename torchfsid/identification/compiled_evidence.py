@@ -67,7 +67,7 @@ def _obstacle_on_device(tensors: Sequence[Tensor], rows: Halfspaces) -> str | No
 
 
 def read(model: ObservationModel, sample: Sample) -> Read:
-    """What the kernels say of a sample."""
+    """What the kernels say of a sample. In the plane slacks and KKT conditions are computed when they are asked for."""
     if sample.rows.dim == 3:
         omega, (informative, alarmed, infeasible, slack, excess), kkt = compiled_in_space.read(model, sample)
         return omega, (informative, alarmed, infeasible), lambda: (slack, excess, kkt)
@@ -84,15 +84,21 @@ def read(model: ObservationModel, sample: Sample) -> Read:
         assert sample.corners is not None
         limits = np.array(saturation.limits, dtype=np.float64)
         clip = limits, saturation.shape == "norm", float(saturation.dead_speed), array(sample.corners)
-    found = kernel.evidence(*map(array, rows + relaxed + others), clip, paper, model.active_tolerance)
-    half_spaces, judged, kkt = found
-    informative, alarmed, infeasible, slack, excess = map(torch.from_numpy, judged)
-    details = slack, excess, KktSolution(*map(torch.from_numpy, kkt))
-    return Halfspaces(*map(torch.from_numpy, half_spaces)), (informative, alarmed, infeasible), lambda: details
+    half_spaces, judged = kernel.evidence(*map(array, rows + relaxed + others), clip, paper, model.active_tolerance)
+    informative, alarmed, infeasible = map(torch.from_numpy, judged)
+    details = cache(partial(_details, model.active_tolerance, sample))
+    return Halfspaces(*map(torch.from_numpy, half_spaces)), (informative, alarmed, infeasible), details
+
+
+def _details(tolerance: float, sample: Sample) -> tuple[Tensor, Tensor, KktSolution]:
+    tensors = sample.rows.A, sample.rows.b, sample.hard, sample.relaxed, sample.C, sample.d, sample.u
+    slacks, kkt = kernel.details(*map(array, (*tensors, torch.atleast_2d(sample.bound))), tolerance)
+    slack, excess = map(torch.from_numpy, slacks)
+    return slack, excess, KktSolution(*map(torch.from_numpy, kkt))
 
 
 def _read_on_device(model: ObservationModel, sample: Sample) -> Read:
-    """What the device's kernels say. Slacks and KKT conditions are computed when they are asked for."""
+    """What the device's kernels say."""
     paper, saturation, u = model.kind == "critical_region", model.task.saturation, sample.u
     (B, m, _), p, bound = sample.rows.A.shape, sample.C.shape[-1], torch.atleast_2d(sample.bound)
     given = (

@@ -107,7 +107,7 @@ class ObservationModel:
 class Evidence:
     """What one measurement says by itself.
 
-    Slacks and KKT conditions are computed when they are first used. On a device this is done from the tensors of the
+    Slacks and KKT conditions are computed when they are first used. In the plane this is done from the tensors of the
     measurement, so that these must not be changed in place before.
 
     Attributes:

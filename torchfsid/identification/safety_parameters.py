@@ -199,7 +199,7 @@ class LearningModel:
         tests = undecided if tested is None else undecided & tested.unsqueeze(-1)
         must = _must_be_active(tests, found, theta, first)
         kept = rows.cuts & found.informative.unsqueeze(-1) & (not self.unknown.soft)
-        return Reading(theta, _cuts(rows, kept, must, found.slack.shape[-1], first), found, undecided & ~must, rows)
+        return Reading(theta, _cuts(rows, kept, must, len(found.hard), first), found, undecided & ~must, rows)
 
     def _bounds(self, measurement: Measurement, robots: int) -> tuple[ErrorBounds, Tensor]:
         noise = self.noise.of_samples(robots, len(measurement.x))

@@ -30,7 +30,7 @@ from typing import no_type_check
 
 import numpy as np
 
-from torchfsid.kernels.compiled import item
+from torchfsid.kernels.compiled import item, item_in_place
 from torchfsid.kernels.linear import invert, on_rows, orthogonalise, solve_upper
 from torchfsid.outcome import Status
 from torchfsid.tolerances import CLEARLY_EMPTY, MOST_ROUNDS, ROUND_OFF
@@ -41,7 +41,7 @@ FACING = 0.71
 OK, EMPTY, UNSOLVED = int(Status.OK), int(Status.EMPTY), int(Status.UNSOLVED)
 
 
-@item
+@item_in_place
 @no_type_check
 def excess(A, b, row, z):
     """The value a.z - b of one row."""
@@ -51,7 +51,7 @@ def excess(A, b, row, z):
     return over
 
 
-@item
+@item_in_place
 @no_type_check
 def most_violated(A, b, z):
     """The row with the largest a.z - b, and that value. Rows with an infinite bound are ignored."""

@@ -37,6 +37,14 @@ def item(function: Callable) -> Any:
     return register_jitable(**_OPTIONS, _nrt=False)(function)
 
 
+def item_in_place(function: Callable) -> Any:
+    """Mark an `item` that is compiled in place of its calls.
+
+    A call passes every array as some ten numbers. With a dozen arrays this takes longer than a short item itself.
+    """
+    return register_jitable(**_OPTIONS, _nrt=False, forceinline=True)(function)
+
+
 def item_of_ordered(function: Callable) -> Any:
     """Mark an `item` whose minima and maxima are those of finite numbers. They compile to vector instructions."""
     return register_jitable(**_OPTIONS, fastmath={"nnan", "nsz"})(function)

@@ -11,7 +11,7 @@ from typing import no_type_check
 
 import numpy as np
 
-from torchfsid.kernels.compiled import item, launcher
+from torchfsid.kernels.compiled import item, item_in_place, launcher
 from torchfsid.kernels.kkt import solve_one
 from torchfsid.kernels.saturation import ROWS, clipped_inverse_optimal, workspace
 from torchfsid.tolerances import (
@@ -31,7 +31,7 @@ DIRECTIONS, CRITICAL_DIRECTIONS = (
 )
 
 
-@item
+@item_in_place
 @no_type_check
 def is_finite(k, C, d):
     """Is the nominal control of robot k finite?"""
@@ -41,7 +41,7 @@ def is_finite(k, C, d):
     return known
 
 
-@item
+@item_in_place
 @no_type_check
 def judge(k, o, A, b, hard, relaxed, u, bound, angles, active_tolerance, unit, unit_b, slack, excess, active, near):
     """Fill the unit rows, the slacks, the active rows and those that may be active (`near`), at place o of the results.
@@ -79,12 +79,21 @@ def judge(k, o, A, b, hard, relaxed, u, bound, angles, active_tolerance, unit, u
     return known, broken, strained, blind
 
 
-@item
+@item_in_place
 @no_type_check
-def outward_normals(angle, order, K, none, around, normals, generator):
+def direction_of(g, angle, unit, exact):
+    """The direction of generator g: that of its row if it is `exact`, without sines."""
+    return (unit[g, 0], unit[g, 1]) if exact else (math.cos(angle), math.sin(angle))
+
+
+@item_in_place
+@no_type_check
+def outward_normals(unit, exact, angle, order, K, none, around, normals, generator):
     """Fill the normals of `identification.normals` for K generators given by their angles.
 
     Args:
+        unit: the unit rows.
+        exact: whether the generators are unit rows. Otherwise they are turned ones.
         angle: the generators' angles [rad], sorted here.
         order: the generators' names, sorted with the angles.
         K: the number of generators.
@@ -118,23 +127,28 @@ def outward_normals(angle, order, K, none, around, normals, generator):
     opening, count = gap - PI, 0
     if opening >= -ANGLE_TOLERANCE:
         end, ray = widest + 1 if widest < K - 1 else 0, opening > ANGLE_TOLERANCE
-        first, turn = angle[widest] + PI / 2, max(opening, 0.0)
-        v, w, cos, sin = math.cos(first), math.sin(first), math.cos(turn / (fan - 1)), math.sin(turn / (fan - 1))
+        x, y = direction_of(order[widest], angle[widest], unit, exact)
+        v, w = -y, x
+        x, y = direction_of(order[end], angle[end], unit, exact)
+        if fan == 3:  # half of the opening, by the sum and the difference of the two ends
+            cos, sin = math.sqrt((v + y) ** 2 + (w - x) ** 2) / 2, math.sqrt((v - y) ** 2 + (w + x) ** 2) / 2
+        else:
+            cos, sin = math.cos(opening / (fan - 1)), math.sin(opening / (fan - 1))
         for i in range(fan if ray else 1):
             if ray and i == fan - 1:  # the two ends must be exact, those between them need not
-                v, w = math.cos(first + turn), math.sin(first + turn)
+                v, w = y, -x
             normals[i, 0], normals[i, 1] = v, w
             generator[i] = order[widest if 2 * i < fan - 1 else end]
             v, w = v * cos - w * sin, w * cos + v * sin
         count = fan if ray else 1
     if other >= PI - ANGLE_TOLERANCE:
-        direction = angle[second] + PI / 2
-        normals[count, 0], normals[count, 1], generator[count] = math.cos(direction), math.sin(direction), order[second]
+        x, y = direction_of(order[second], angle[second], unit, exact)
+        normals[count, 0], normals[count, 1], generator[count] = -y, x, order[second]
         count += 1
     return count, opening if opening > ANGLE_TOLERANCE else 0.0
 
 
-@item
+@item_in_place
 @no_type_check
 def find_generators(k, unit, chosen, angles, angle, order):
     """Fill the angles and names of the chosen rows, each turned by the fractions `SPREAD` of its error.
@@ -153,7 +167,7 @@ def find_generators(k, unit, chosen, angles, angle, order):
     return K
 
 
-@item
+@item_in_place
 @no_type_check
 def critical_region(
     k, o, unit, unit_b, C, d, G, f, P, offset, active, normals, generator, count, row_A, row_b, row_source
@@ -183,7 +197,7 @@ def critical_region(
     return R
 
 
-@item
+@item_in_place
 @no_type_check
 def inverse_optimal(k, m, u, ball, C, d, normals, generator, count, none, row_A, row_b, row_source):
     """The rows of `identification.inverse_optimal_set` that are not padding."""
@@ -196,13 +210,13 @@ def inverse_optimal(k, m, u, ball, C, d, normals, generator, count, none, row_A,
         row_source[k, n] = 2 * m if generator[n] == none else m + generator[n] % m
 
 
-@item
+@item_in_place
 @no_type_check
-def read_one(k, o, rows, sample, angles, fan, around, relaxes, paper, solves, active_tolerance, scratch, judged, kkt):
+def read_one(k, o, rows, sample, angles, fan, around, relaxes, paper, active_tolerance, scratch, judged, kkt):
     """Fill what `evidence` returns of robot k but for half-spaces, and find its normals. Returns their number.
 
-    It is -1 if the robot is not informative. Slacks and KKT conditions are those at place o. They are solved only if
-    that is asked for (`solves`).
+    It is -1 if the robot is not informative. Slacks and KKT conditions are those at place o. These are solved only for
+    the critical region (`paper`).
     """
     A, b, hard, relaxed = rows
     C, d, u, usable, bound = sample
@@ -216,18 +230,30 @@ def read_one(k, o, rows, sample, angles, fan, around, relaxes, paper, solves, ac
     usable_here = usable[k] and known and wish_known
     alarmed[k], informative[k] = usable_here and broken, usable_here and not broken and not blind
     infeasible[k] = False
-    if solves:
-        solve_one(k, o, C, d, wish_known, unit, unit_b, kkt)
     if not (informative[k] or (relaxes and usable_here and not broken)):
         return -1
+    if paper:
+        solve_one(k, o, C, d, wish_known, unit, unit_b, kkt)
     found = find_generators(k, unit, active[o] if paper else near, fan, angle, order)
-    count, opening = outward_normals(angle, order, found, len(order), around, normals, generator)
+    count, opening = outward_normals(
+        unit, fan.shape[1] == 0, angle, order, found, len(order), around, normals, generator
+    )
     if relaxes:
         pointed = opening > 0 and not blind
         alarmed[k] = strained and not blind and opening > RELAXED_OPENING
         informative[k] = pointed and not strained
         infeasible[k] = not alarmed[k] and not informative[k]
     return count if informative[k] else -1
+
+
+@item_in_place
+@no_type_check
+def pad_rows(k, count, row_A, row_b, row_source):
+    """Fill the half-spaces of robot k behind the first `count` with padding."""
+    for n in range(count, row_b.shape[1]):
+        row_b[k, n], row_source[k, n] = 1.0, -1
+        for e in range(row_A.shape[2]):
+            row_A[k, n, e] = 0.0
 
 
 @item
@@ -240,7 +266,7 @@ def rows_for(m, paper, clips):
 @launcher
 @no_type_check
 def evidence(A, b, hard, relaxed, C, d, u, usable, bound, angles, ball, drift, clip, paper, active_tolerance):
-    """What a measurement of B robots says about theta, and their KKT conditions.
+    """What a measurement of B robots says about theta.
 
     Args:
         A: (B, m, 2), the rows over the control.
@@ -261,19 +287,16 @@ def evidence(A, b, hard, relaxed, C, d, u, usable, bound, angles, ball, drift, c
         active_tolerance: the slack below which a row counts as active [m/s].
 
     Returns:
-        Half-spaces (A, b, source), padded. Then (informative, alarmed, infeasible, slack, excess), as in `Evidence`.
-        Then (G, f, projector, free, offset, active, n_active, rank, case), as in `KktSolution`.
+        Half-spaces (A, b, source), padded, and (informative, alarmed, infeasible), as in `Evidence`.
     """
-    (B, m), fan = b.shape, angles[:, :0] if paper else angles
+    (B, m), fan, clips = b.shape, angles[:, :0] if paper else angles, len(clip[0]) > 0
     generators = m * len(SPREAD) if fan.shape[1] > 0 else m
     around, work = CRITICAL_DIRECTIONS if paper else DIRECTIONS, workspace(clip[3].shape[1])
-    R = rows_for(m, paper, len(clip[0]) > 0)
-    half_spaces = np.zeros((B, R, C.shape[2])), np.ones((B, R)), np.full((B, R), -1)
-    judged = np.empty(B, np.bool_), np.empty(B, np.bool_), np.empty(B, np.bool_), np.empty((B, m)), np.empty((B, m))
-    kkt = (
-        np.empty((B, 2, C.shape[2])), np.empty((B, 2)), np.empty((B, 2, 2)), np.empty((B, 2, 2)), np.empty((B, 2)),
-        np.empty((B, m), np.bool_), np.empty(B, np.int64), np.empty(B, np.int64), np.empty(B, np.int64),
-    )  # fmt: skip
+    R = rows_for(m, paper, clips)
+    half_spaces = np.empty((B, R, C.shape[2])), np.empty((B, R)), np.empty((B, R), np.int64)
+    informative, alarmed, infeasible = np.empty(B, np.bool_), np.empty(B, np.bool_), np.empty(B, np.bool_)
+    slack, excess, kkt = np.empty((1, m)), np.empty((1, m)), room_for_kkt(1, m, C.shape[2])
+    judged = informative, alarmed, infeasible, slack, excess
     scratch = (
         np.zeros((m, 2)), np.empty(m), np.empty(m, np.bool_), np.empty(generators), np.empty(generators, np.int64),
         np.empty((len(around) + 1, 2)), np.empty(len(around) + 1, np.int64),
@@ -281,17 +304,42 @@ def evidence(A, b, hard, relaxed, C, d, u, usable, bound, angles, ball, drift, c
     rows, sample, relaxes = (A, b, hard, relaxed), (C, d, u, usable, bound), relaxed.any()
     for k in range(B):
         count = read_one(
-            k, k, rows, sample, angles, fan, around, relaxes, paper, True, active_tolerance, scratch, judged, kkt
+            k, 0, rows, sample, angles, fan, around, relaxes, paper, active_tolerance, scratch, judged, kkt
         )
-        if count < 0:
-            continue
-        of = *scratch[5:], count
-        if paper:
-            critical_region(k, k, *scratch[:2], C, d, *kkt[:3], *kkt[4:6], *of, *half_spaces)
-        else:
-            room, shift = ball[min(k, len(ball) - 1)], drift[min(k, len(drift) - 1)]
-            if len(clip[0]) > 0:
-                clipped_inverse_optimal(k, m, u, room, shift, C, d, clip, *of, generators, work, *half_spaces)
-            else:
-                inverse_optimal(k, m, u, room + shift, C, d, *of, generators, *half_spaces)
-    return half_spaces, judged, kkt
+        of, room, shift = (*scratch[5:], count), ball[min(k, len(ball) - 1)], drift[min(k, len(drift) - 1)]
+        if count >= 0 and paper:
+            count = critical_region(k, 0, *scratch[:2], C, d, *kkt[:3], *kkt[4:6], *of, *half_spaces)
+        elif count >= 0 and clips:
+            count = clipped_inverse_optimal(k, m, u, room, shift, C, d, clip, *of, generators, work, *half_spaces)
+        elif count >= 0:
+            inverse_optimal(k, m, u, room + shift, C, d, *of, generators, *half_spaces)
+        pad_rows(k, max(count, 0), *half_spaces)
+    return half_spaces, (informative, alarmed, infeasible)
+
+
+@launcher
+@no_type_check
+def room_for_kkt(B, m, p):
+    """Arrays (G, f, projector, free, offset, active, n_active, rank, case), as in `KktSolution`."""
+    return (
+        np.empty((B, 2, p)), np.empty((B, 2)), np.empty((B, 2, 2)), np.empty((B, 2, 2)), np.empty((B, 2)),
+        np.empty((B, m), np.bool_), np.empty(B, np.int64), np.empty(B, np.int64), np.empty(B, np.int64),
+    )  # fmt: skip
+
+
+@launcher
+@no_type_check
+def details(A, b, hard, relaxed, C, d, u, bound, active_tolerance):
+    """The slacks and KKT conditions of B robots, with the arguments of `evidence`.
+
+    Returns:
+        (slack, excess), as in `Evidence`, and (G, f, projector, free, offset, active, n_active, rank, case), as in
+        `KktSolution`.
+    """
+    (B, m), exact = b.shape, u[:, :0]
+    slack, excess, kkt = np.empty((B, m)), np.empty((B, m)), room_for_kkt(B, m, C.shape[2])
+    unit, unit_b, near = np.empty((m, 2)), np.empty(m), np.empty(m, np.bool_)
+    for k in range(B):
+        judge(k, k, A, b, hard, relaxed, u, bound, exact, active_tolerance, unit, unit_b, slack, excess, kkt[5], near)
+        solve_one(k, k, C, d, is_finite(k, C, d), unit, unit_b, kkt)
+    return (slack, excess), kkt

@@ -12,7 +12,7 @@ from typing import no_type_check
 
 import numpy as np
 
-from torchfsid.kernels.compiled import item
+from torchfsid.kernels.compiled import item, item_in_place
 from torchfsid.kernels.linear import dot
 from torchfsid.outcome import Status
 
@@ -22,7 +22,7 @@ SHORT, LONG = 1e-100, 1e100
 """Largest numbers that need no scaling."""
 
 
-@item
+@item_in_place
 @no_type_check
 def power_of_two(largest):
     """The power of two that scales numbers up to `largest` exactly, so that their squares do not over- or underflow.
@@ -35,7 +35,7 @@ def power_of_two(largest):
     return math.ldexp(1.0, min(1 - exponent, 1023))
 
 
-@item
+@item_in_place
 @no_type_check
 def scale_of(A, row):
     """The `power_of_two` of a row."""
@@ -90,7 +90,7 @@ def unwhiten(L, x):
         x[i] /= L[i, i]
 
 
-@item
+@item_in_place
 @no_type_check
 def to_frame(A, b, y, L, metric, unit, offsets, sizes, lengths):
     """Fill the rows in the frame of the point y and the metric L L'.
@@ -140,7 +140,7 @@ def to_frame(A, b, y, L, metric, unit, offsets, sizes, lengths):
     return status
 
 
-@item
+@item_in_place
 @no_type_check
 def from_frame(L, metric, y, z, x):
     """Fill the point z of x = L'(z - y). Returns the size of the numbers that z was computed from."""
@@ -159,7 +159,7 @@ def from_frame(L, metric, y, z, x):
     return size
 
 
-@item
+@item_in_place
 @no_type_check
 def distance(A, b, row, z, lengths):
     """The value (a.z - b) / |a| of one row, with the lengths from `to_frame`."""

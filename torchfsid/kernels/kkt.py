@@ -14,11 +14,24 @@ from __future__ import annotations
 import math
 from typing import no_type_check
 
-from torchfsid.kernels.compiled import item
+from torchfsid.kernels.compiled import item_in_place
 from torchfsid.tolerances import RANK_TOLERANCE
 
 
-@item
+@item_in_place
+@no_type_check
+def principal_axes(p, q, r):
+    """The first principal axis (cos, sin) of rows with the Gram matrix [[p, q], [q, r]], cos >= 0."""
+    difference, size = p - r, math.sqrt((p - r) ** 2 + 4 * q * q)
+    if size == 0.0:
+        return 1.0, 0.0
+    longer = math.sqrt((1 + abs(difference) / size) / 2)
+    shorter = abs(q) / (size * longer)
+    cos, sin = (longer, shorter) if difference >= 0 else (shorter, longer)
+    return cos, math.copysign(sin, q)
+
+
+@item_in_place
 @no_type_check
 def solve_active(o, unit, unit_b, active, offset, projector):
     """Fill A_a^+ b_a and A_a^+ A_a for the active rows. Returns their number K and their rank."""
@@ -29,18 +42,18 @@ def solve_active(o, unit, unit_b, active, offset, projector):
             p, q, r = p + unit[j, 0] ** 2, q + unit[j, 0] * unit[j, 1], r + unit[j, 1] ** 2
     if K == 0:
         return 0, 0
-    turn = math.atan2(2 * q, p - r) / 2
-    cos, sin = math.cos(turn), math.sin(turn)
+    cos, sin = principal_axes(p, q, r)
     yy = yz = yb = ww = wb = v0 = v1 = 0.0
     for j in range(len(unit_b)):
         if active[o, j]:
             y, z = cos * unit[j, 0] + sin * unit[j, 1], cos * unit[j, 1] - sin * unit[j, 0]
             yy, yz, yb = yy + y * y, yz + y * z, yb + y * unit_b[j]
             v0, v1 = v0 + y * unit[j, 0], v1 + y * unit[j, 1]
+    share = yz / yy
     for j in range(len(unit_b)):
         if active[o, j]:
             y, z = cos * unit[j, 0] + sin * unit[j, 1], cos * unit[j, 1] - sin * unit[j, 0]
-            w = z - y * yz / yy
+            w = z - y * share
             ww, wb = ww + w * w, wb + w * unit_b[j]
     if ww > RANK_TOLERANCE**2 * yy:
         second = wb / ww
@@ -61,7 +74,7 @@ def solve_active(o, unit, unit_b, active, offset, projector):
     return K, 1
 
 
-@item
+@item_in_place
 @no_type_check
 def solve_motion(k, o, C, d, wish_known, rank, offset, projector, free, G, f):
     """Fill G and f of u* = G theta + f, and free = I - P, which is exactly zero at full rank, at place o."""
@@ -76,7 +89,7 @@ def solve_motion(k, o, C, d, wish_known, rank, offset, projector, free, G, f):
                 G[o, i, e] = free[o, i, 0] * C[k, 0, e] + free[o, i, 1] * C[k, 1, e]
 
 
-@item
+@item_in_place
 @no_type_check
 def solve_one(k, o, C, d, wish_known, unit, unit_b, kkt):
     """Fill the KKT conditions of robot k, from its unit rows and the active ones, at place o of `kkt`."""

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from typing import no_type_check
 
-from torchfsid.kernels.compiled import item
+from torchfsid.kernels.compiled import item, item_in_place
 from torchfsid.tolerances import ROUND_OFF
 
 
-@item
+@item_in_place
 @no_type_check
 def dot(v, w):
     total = 0
@@ -21,7 +21,7 @@ def dot(v, w):
     return total
 
 
-@item
+@item_in_place
 @no_type_check
 def orthogonalise(v, Q, D, k, share):
     """Subtract from v its component in the span of the first k rows of Q, the sum of share_i Q_i.
@@ -53,7 +53,7 @@ def orthogonalise(v, Q, D, k, share):
     return left
 
 
-@item
+@item_in_place
 @no_type_check
 def solve_upper(T, right, k, x):
     """Solve sum_s x_s a_s = sum_i right_i Q_i for x, with the k rows a_s = Q_s + sum_i<s T_si Q_i."""
@@ -63,7 +63,7 @@ def solve_upper(T, right, k, x):
             x[i] -= T[j, i] * x[j]
 
 
-@item
+@item_in_place
 @no_type_check
 def on_rows(b, Q, D, T, k, y, z):
     """Find z = sum_i y_i Q_i with a_s.z = b_s for the k rows a_s = Q_s + sum_i<s T_si Q_i."""
@@ -80,7 +80,7 @@ def on_rows(b, Q, D, T, k, y, z):
             z[j] += y[s] * Q[s, j]
 
 
-@item
+@item_in_place
 @no_type_check
 def solve_rows(N, k, pull, offsets, Q, D, T, work, z, mu):
     """Solve z + N' mu = pull, N z = offsets for the first k rows of N.

@@ -18,7 +18,7 @@ from typing import no_type_check
 import numpy as np
 
 from torchfsid.kernels.active_rows import excess, inscribed_rows, nearest_rows
-from torchfsid.kernels.compiled import item, launcher
+from torchfsid.kernels.compiled import item, item_in_place, launcher
 from torchfsid.kernels.frame import cholesky, distance, from_frame, to_frame, unwhiten
 from torchfsid.kernels.linear import dot, solve_rows
 from torchfsid.outcome import Status
@@ -31,7 +31,7 @@ IMPOSSIBLE, BOUNDLESS = -1, -2
 """EMPTY by a row 0.z <= b < 0, and UNBOUNDED for want of a largest ball: there is no finite radius."""
 
 
-@item
+@item_in_place
 @no_type_check
 def finish_nearest(A, b, y, L, metric, unit, sizes, lengths, rows, k, Q, D, T, work, N, x, z, mu):
     """Fill the point z and the multipliers mu of the given rows, from the active rows and the point x in the frame.

@@ -18,17 +18,17 @@ from typing import no_type_check
 
 import numpy as np
 
-from torchfsid.kernels.compiled import item, launcher
+from torchfsid.kernels.compiled import item_in_place, launcher
 from torchfsid.kernels.evidence import CRITICAL_DIRECTIONS, find_generators, outward_normals
 from torchfsid.kernels.frame import scale_of
-from torchfsid.kernels.kkt import solve_active
+from torchfsid.kernels.kkt import principal_axes, solve_active
 from torchfsid.tolerances import RANK_TOLERANCE
 
 FAN = len(CRITICAL_DIRECTIONS)
 LEAST = RANK_TOLERANCE**2
 
 
-@item
+@item_in_place
 @no_type_check
 def to_unit(k, A, b, active, unit, unit_b, length, on):
     """Fill the unit rows of item k, the lengths of the rows and the active rows. Zero rows are never active."""
@@ -41,7 +41,7 @@ def to_unit(k, A, b, active, unit, unit_b, length, on):
         unit[j, 0], unit[j, 1], unit_b[j], length[j] = p / size, q / size, b[k, j] * scale / size, size / scale
 
 
-@item
+@item_in_place
 @no_type_check
 def solve(unit, unit_b, on, offset, P, angle, order, normals, generator):
     """Fill offset, P and the normals with their generators. Returns the rank and the number of normals."""
@@ -49,18 +49,18 @@ def solve(unit, unit_b, on, offset, P, angle, order, normals, generator):
         offset[0, i], P[0, i, 0], P[0, i, 1] = 0.0, 0.0, 0.0
     _, rank = solve_active(0, unit, unit_b, on, offset, P)
     found = find_generators(0, unit, on[0], unit[:, :0], angle, order)
-    count, _ = outward_normals(angle, order, found, len(order), CRITICAL_DIRECTIONS, normals, generator)
+    count, _ = outward_normals(unit, True, angle, order, found, len(order), CRITICAL_DIRECTIONS, normals, generator)
     return rank, count
 
 
-@item
+@item_in_place
 @no_type_check
 def place_of(n, count):
     """The place of the n-th normal, as in `identification.normals`: behind the fan comes that of a line."""
     return FAN if n == count - 1 and (count == 2 or count == FAN + 1) else n
 
 
-@item
+@item_in_place
 @no_type_check
 def across(P, v, w):
     """(I - P) (v, w)."""
@@ -171,7 +171,7 @@ def critical_regions_vjp(A, b, active, C, d, grad_A, grad_b):
     return to_A, to_b, to_C, to_d
 
 
-@item
+@item_in_place
 @no_type_check
 def solve_vjp(on, unit, unit_b, offset, P, rank, of_x, of_y, of_P, of_unit, of_bound):
     """Add the derivatives of the active rows that pass through their offset and, at rank 1, through P."""
@@ -183,8 +183,7 @@ def solve_vjp(on, unit, unit_b, offset, P, rank, of_x, of_y, of_P, of_unit, of_b
         if on[0, j]:
             v, w = unit[j, 0], unit[j, 1]
             one, two, three = one + v * v, two + v * w, three + w * w
-    turn = math.atan2(2 * two, one - three) / 2
-    cos, sin = math.cos(turn), math.sin(turn)
+    cos, sin = principal_axes(one, two, three)
     for j in range(len(unit_b)):
         if on[0, j]:
             y, z = cos * unit[j, 0] + sin * unit[j, 1], cos * unit[j, 1] - sin * unit[j, 0]

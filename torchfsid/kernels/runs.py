@@ -24,7 +24,7 @@ from typing import no_type_check
 import numpy as np
 
 from torchfsid.kernels.active_rows import nearest_rows
-from torchfsid.kernels.compiled import item, launcher
+from torchfsid.kernels.compiled import item_in_place, launcher
 from torchfsid.kernels.frame import to_frame
 from torchfsid.kernels.programmes import finish_nearest
 from torchfsid.outcome import Status
@@ -33,7 +33,7 @@ from torchfsid.tolerances import ROUND_OFF
 OK = int(Status.OK)
 
 
-@item
+@item_in_place
 @no_type_check
 def row_of(p, q, keeping):
     """The row (a, b) of `robots.avoidance.CollisionAvoidance` for a body from which the way to the robot is (p, q)."""
@@ -44,7 +44,7 @@ def row_of(p, q, keeping):
     return -(p / length), -(q / length), gain * (h if power == 1.0 else math.copysign(abs(h) ** power, h))
 
 
-@item
+@item_in_place
 @no_type_check
 def row_vjp(p, q, keeping, of_a, of_b):
     """The vector-Jacobian product of `row_of` with respect to (p, q)."""
@@ -58,7 +58,7 @@ def row_vjp(p, q, keeping, of_a, of_b):
     return slope * p - of_a[0] / length, slope * q - of_a[1] / length
 
 
-@item
+@item_in_place
 @no_type_check
 def run_one(k, start, goals, bodies, robot, run, scratch):
     """Run robot k, see `run_to_goals`."""
@@ -99,7 +99,7 @@ def run_one(k, start, goals, bodies, robot, run, scratch):
                 x[k, t + 1, i] = x[k, t, i] + dt * u[k, t, i]
 
 
-@item
+@item_in_place
 @no_type_check
 def weights(first, second, count, v, w):
     """The y of (v, w) = s + y_1 first + y_2 second, N s = 0, for the first `count` of the two rows N."""
@@ -110,7 +110,7 @@ def weights(first, second, count, v, w):
     return (first[0] * v + first[1] * w) / square if count == 1 else 0.0, 0.0
 
 
-@item
+@item_in_place
 @no_type_check
 def return_one(k, goals, bodies, robot, run, grad_x, grad_u, grad_path):
     """Fill `grad_path` for robot k, see `return_to_path`."""

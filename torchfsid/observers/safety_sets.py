@@ -98,7 +98,7 @@ class SafetySets:
         """
         t, before = measurement.time, self.possible
         read = self.model.read(before, measurement, self.compiled, self.status < Status.INCONSISTENT)
-        psi, self._rows = before.psi, read.evidence.slack.shape[-1]
+        psi, self._rows = before.psi, len(read.evidence.hard)
         for then, cuts in self._believed(read.cuts, t):
             psi = cuts.apply(psi, before.owner, then)
         theta = read.theta

@@ -21,7 +21,7 @@ from torchfsid.kernels import evidence as reading
 from torchfsid.kernels.compiled import item
 from torchfsid.kernels.cuda.arrays import real, short, truth, whole
 from torchfsid.kernels.cuda.launch import Arrays, launch_by_address
-from torchfsid.kernels.evidence import critical_region, inverse_optimal, is_finite, judge, read_one
+from torchfsid.kernels.evidence import critical_region, inverse_optimal, is_finite, judge, pad_rows, read_one
 from torchfsid.kernels.kkt import solve_one
 from torchfsid.kernels.polygon import (
     EMPTY,
@@ -90,7 +90,7 @@ def evidence(
 
 
 def details(given: Sequence[Arrays], values: tuple[float], results: Sequence[Arrays], stream: int = 0) -> None:
-    """The slacks and KKT conditions of `evidence.evidence`.
+    """The slacks and KKT conditions, see `evidence.details`.
 
     Args:
         given: (A, b, hard, relaxed), (C, d, u) and (bound,).
@@ -158,16 +158,6 @@ def _clip(R: int, W: int, listed: bool) -> Callable:
     return cuda.jit(clip_kernel)
 
 
-@item
-@no_type_check
-def pad_rows(k, count, row_A, row_b, row_source):
-    """Fill the half-spaces of robot k behind the first `count` with padding."""
-    for n in range(count, row_b.shape[1]):
-        row_b[k, n], row_source[k, n] = 1.0, -1
-        for e in range(row_A.shape[2]):
-            row_A[k, n, e] = 0.0
-
-
 @cache
 def _evidence(m: int, p: int, paper: bool, uncertain: bool, slots: int) -> Callable:
     """The kernel for m rows and p parameters, and for clipped nominal controls if sets have slots for vertices."""
@@ -203,7 +193,7 @@ def _evidence(m: int, p: int, paper: bool, uncertain: bool, slots: int) -> Calla
         offset, active = cuda.local.array((1, 2), float64), cuda.local.array((1, m), boolean)
         n_active, rank, case = cuda.local.array(1, int32), cuda.local.array(1, int32), cuda.local.array(1, int32)
         count = read_one(
-            k, 0, rows, (C, d, u, usable, bound), angles, fan, around, relaxes, paper, paper, tolerance, scratch,
+            k, 0, rows, (C, d, u, usable, bound), angles, fan, around, relaxes, paper, tolerance, scratch,
             (informative, alarmed, infeasible, slack, excess),
             (G, f, projector, free, offset, active, n_active, rank, case),
         )  # fmt: skip
