@@ -122,6 +122,19 @@ def test_no_robots_say_nothing(compiled: bool) -> None:
     assert evidence(model, prior(0), measurement, compiled).omega.A.shape[0] == 0
 
 
+def test_what_is_read_later_is_what_was_measured() -> None:
+    """The tensors of a measurement may be used again: slacks and KKT conditions are of the numbers it had."""
+    x, body, u = crowd(20)
+    model, there = ObservationModel(TASK, [AVOIDANCE], "inverse_optimal", NOISE), torch.ones(20, 4, dtype=torch.bool)
+    kept = evidence(model, prior(20), Measurement(0.0, x, u, body, there))
+    given = [part.clone() for part in (x, u, body)]
+    reused = evidence(model, prior(20), Measurement(0.0, *given, there))
+    for part in given:
+        part += 1.0
+    torch.testing.assert_close(reused.slack, kept.slack, rtol=0, atol=0)
+    torch.testing.assert_close(reused.kkt.f, kept.kkt.f, rtol=0, atol=0)
+
+
 def test_wrong_use_is_refused() -> None:
     x, body, u = crowd(3)
     measurement = Measurement(0.0, x, u, body, torch.ones(3, 4, dtype=torch.bool))

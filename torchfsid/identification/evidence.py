@@ -107,8 +107,7 @@ class ObservationModel:
 class Evidence:
     """What one measurement says by itself.
 
-    Slacks and KKT conditions are computed when they are first used. In the plane this is done from the tensors of the
-    measurement, so that these must not be changed in place before.
+    Slacks and KKT conditions in the plane are computed when they are first used.
 
     Attributes:
         omega: half-spaces of theta, all padding where the sample is not used. Their sources are those of
@@ -246,7 +245,8 @@ def read_sample(model: ObservationModel, sample: Sample, compiled: bool | None) 
 def sample_of(model: ObservationModel, theta: FeasibleSet, measurement: Measurement) -> Sample:
     """The model at one measurement."""
     assert measurement.u is not None
-    robots, items, u = theta.batch_shape.numel(), len(measurement.x), measurement.u.to(torch.float64)
+    robots, items = theta.batch_shape.numel(), len(measurement.x)
+    u = measurement.u.to(torch.float64, copy=True)  # it is read again later, when the caller may have changed it
     if measurement.x.ndim != 2 or len(theta.batch_shape) != 1 or items % max(robots, 1) != 0:
         expected = f"a batch of {tuple(theta.batch_shape)} robots, or several of them"
         raise InputError("measurement", expected, tuple(measurement.x.shape))
