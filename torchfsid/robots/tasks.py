@@ -3,8 +3,7 @@ r"""Tasks: nominal controls that are affine in an unknown parameter (G., Sec. II
     uhat(x; theta) = C(x) theta + d(x),      C (*batch, n, p),  d (*batch, n).
 
 The control uhat is a velocity [m/s], or an acceleration [m/s2] for robots of second order. Every task is a frozen
-record. Called with a `Measurement`, it returns (C, d). The paper asks for such a library of
-task-to-function mappings. The robots of its experiments use `GoalTask`: C = kp I, d = -kp x, theta = x_d.
+record. Called with a `Measurement`, it returns (C, d). The robots of the paper use `GoalTask`: C = kp I, d = -kp x.
 """
 
 from __future__ import annotations
