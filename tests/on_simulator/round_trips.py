@@ -49,7 +49,7 @@ def test_the_model_at_a_measurement_waits_for_nothing(
     found = counted(lambda: sample_of(model, prior, measurement))
     assert not found.waits
     if noise is EXACT:
-        assert found.operations <= 60 + 10 * len(barriers)
+        assert found.operations <= 61 + 10 * len(barriers)  # one of them keeps a copy of the controls
 
 
 def test_an_update_waits_once(measurement: Measurement) -> None:
