@@ -195,7 +195,7 @@ def reals(name: str, value: object) -> Tensor:
 
 def finite(*tensors: Tensor) -> bool:
     """Are all numbers finite? The sum is tested first, because it is finite unless a number is not or it overflows."""
-    return math.isfinite(float(sum(t.detach().sum() for t in tensors))) or all(
+    return math.isfinite(sum(t.detach().sum().item() for t in tensors)) or all(
         bool(t.isfinite().all()) for t in tensors
     )
 
@@ -210,4 +210,4 @@ def _largest(tensor: Tensor) -> float:
 
 def array(tensor: Tensor) -> np.ndarray:
     """The tensor as a contiguous array on the CPU, which kernels take. It is copied only if it is not one already."""
-    return np.ascontiguousarray(tensor.detach().contiguous().numpy(force=True))  # torch copies faster
+    return tensor.contiguous().numpy(force=True)  # torch copies faster than numpy
